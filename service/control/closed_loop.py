@@ -30,10 +30,9 @@ if TYPE_CHECKING:  # these import the compiler, which most requests never need
 
 _REST_TOLERANCE = 0.02  # of a step: smaller movements count as rest
 _LIMIT_TOLERANCE = 1e-9  # of the limit
-_START_ADVICE = (
-    "the step metrics include its settling. Give the initial states, such as x(0), "
-    "or a later step time"
-)
+_START_ADVICE = "the step metrics include its settling. Let the reference step later"
+_STABILITY_ADVICE = "Choose a smaller gain, a longer integral time, or another sign"
+_TUNING_ADVICE = "Choose another tuning rule, or set gain and times by hand"
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +100,7 @@ def simulate_closed_loop(
     controller = _to_controller_out(used, command.values)
     notes += [
         *_describe_start(times, outputs, control),
-        *_describe_stability(metrics, margins, controller),
+        *_describe_stability(metrics, margins, controller, is_tuned=tuning is not None),
     ]
     return LoopResponse(
         outputs, simulated.channel(loop.input), command, notes, metrics, controller, tuning, margins
@@ -136,9 +135,24 @@ def check_transport_delay(control: ControlIn | None, duration: float) -> None:
         if delay >= duration:
             raise InvalidRequest.from_fault(
                 "/control/transport/delay",
-                f"found {delay:g} s, but the simulation lasts {duration:g} s. Give more samples "
-                "or a shorter delay",
+                f"found {delay:g} s, but the simulation lasts {duration:g} s. Simulate longer, "
+                "or give a shorter delay",
             )
+
+
+def suggest_controller(
+    model: Model, values: Mapping[str, float], input: str, output: str
+) -> dict[str, float] | None:
+    """Suggest gain and integral time by SIMC for a PI controller; None if it has no answer."""
+    from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
+    from sysid.control.tuning import tune_controller
+
+    complete = tuple(IdentifiedValue(name, value) for name, value in values.items())
+    try:
+        tuned = tune_controller(IdentifiedModel(model, complete), input, output)
+    except InvalidSettings:
+        return None
+    return {"gain": tuned.gain, "integral_time": tuned.integral_time}
 
 
 def _build_identified(model: Model, values: Mapping[str, float]) -> "IdentifiedModel":
@@ -266,12 +280,12 @@ def _check_loop_finite(
             raise InvalidRequest.from_fault(
                 "/sample_time",
                 f"{detail}. The loop is stable, but steps of {step:.4g} s are too long to "
-                "simulate it. Give a smaller sample_time",
+                "simulate it. Give a shorter sampling period",
             ) from None
         raise InvalidRequest.from_fault(
             "/control/tuning" if is_tuned else "/control/gain",
-            f"found {gain:g}, with which the loop diverges: {detail}. Choose a smaller "
-            "gain, a longer integral_time, a limit, or another sign",
+            f"found {gain:g}, with which the loop diverges: {detail}. "
+            f"{_advise_stability(is_tuned)}",
         ) from None
 
 
@@ -321,8 +335,16 @@ def _describe_start(
     )
 
 
+def _advise_stability(is_tuned: bool) -> str:
+    return _TUNING_ADVICE if is_tuned else _STABILITY_ADVICE
+
+
 def _describe_stability(
-    metrics: StepMetricsOut | None, margins: MarginsOut | None, controller: ControllerOut
+    metrics: StepMetricsOut | None,
+    margins: MarginsOut | None,
+    controller: ControllerOut,
+    *,
+    is_tuned: bool,
 ) -> Iterator[str]:
     """Report a loop that is unstable or keeps oscillating."""
     if metrics is not None and metrics.swing is not None:
@@ -340,5 +362,5 @@ def _describe_stability(
     if margins is not None and not margins.is_stable:
         yield (
             "the loop is unstable (by its transfer function, without the controller's limits). "
-            "Choose a smaller gain, a longer integral_time, or another sign"
+            f"{_advise_stability(is_tuned)}"
         )

@@ -174,7 +174,7 @@ def check_finite_outputs(outputs: Sequence[Channel], times: FloatArray) -> None:
             raise InvalidRequest.from_fault(
                 "/parameters",
                 f"with these values output {channel.name!r} diverges at "
-                f"t = {times[invalid[0]]:g} s; choose other values, or a smaller sample_time",
+                f"t = {times[invalid[0]]:g} s; choose other values, or a shorter sampling period",
             )
 
 

@@ -14,6 +14,8 @@ from sysid.figures.plotly import Figure
 from sysid.figures.signals import axis_id, name_axis, signal_line, stack_plots
 
 _OUTPUT_PX, _INPUT_PX = 260, 120
+_LEAD = 0.1
+"""Share of the time after a step that is shown before it."""
 _WHOLE_SPAN = slice(None)
 _LINE_STYLE = {"layer": "below", "line": {"color": theme.HAIRLINE, "width": 1, "dash": "dot"}}
 
@@ -53,6 +55,14 @@ def plot_simulation(simulation: RunSimulationOut, step_time: float | None = None
         name = "command" if is_command else signal.name
         name_axis(figure, number, f"{name}{bracket_unit(signal.unit)}")
     return figure
+
+
+def begin_near_step(figure: Figure, step_time: float) -> None:
+    """Leave out what was long before the step of the reference, such as the start of the loop."""
+    for trace in figure["data"]:
+        times = np.asarray(trace["x"], dtype=np.float64)
+        first = int(np.searchsorted(times, step_time - _LEAD * (times[-1] - step_time)))
+        trace["x"], trace["y"] = trace["x"][first:], trace["y"][first:]
 
 
 def apply_units(simulation: RunSimulationOut, units: Mapping[str, str]) -> RunSimulationOut:

@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session
 from service.core.errors import InvalidRequest, QuotaExceeded
 from service.core.settings import Settings
 from service.core.states import JobState
+from service.core.text import name_label
 from service.datasets.rms_unit import find_rms_unit
 from service.jobs.axes import build_axis_groups, count_runs, group_axes
 from service.jobs.checks import JobChecker
@@ -192,10 +193,10 @@ def resume_job(session: Session, job_id: str, settings: Settings) -> Job:
 
 
 def clone_job(database: Database, job_id: str, settings: Settings) -> JobOut:
-    """Queue the same request as a new job."""
+    """Queue the same request as a new job. A name that the service chose is chosen again."""
     with database.read_session() as session:
         old = JobRepository(session).get(job_id)
-    body = JobIn.model_validate({**old.spec, "name": old.name})
+    body = JobIn.model_validate({**old.spec, "name": old.spec["name"] and old.name})
     return submit_job(database, body, settings)
 
 
@@ -263,6 +264,9 @@ def list_jobs(
 
 
 def _choose_name(checker: JobChecker, spec: Mapping[str, Any]) -> str:
-    model = spec["model"]["name"] if isinstance(spec["model"], Mapping) else spec["model"]
+    """Name a job after its model and data, or after the label of its trend."""
+    model = find_model_name(spec)
+    if spec["trend"]:
+        return f"{model} over {name_label(spec['trend']['x'])}"
     data = checker.get_dataset(spec["datasets"][0])
     return f"{model} on {data if isinstance(data, str) else data.name}"

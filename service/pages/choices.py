@@ -45,8 +45,22 @@ TEXTS: Mapping[str, str] = {
 """Texts of names; a name without a text is shown itself."""
 
 
+_LABELS: Mapping[str, str] = {"noise_model": "noise", "kind": "loss"}
+"""Labels of fields that are not called like the setting."""
+
+
 def list_choices() -> dict[str, list[tuple[str, str]]]:
     """List values and texts of every field with choices."""
     return {
         field: [(name, TEXTS.get(name, name)) for name in names] for field, names in NAMES.items()
     }
+
+
+def write_choice(part: str, name: str, value: str) -> str:
+    """Write a setting of a note as the form has it: the field's label and the chosen text.
+
+    >>> write_choice("hold", "u", "zero")
+    '“u between samples: held (zero)”'
+    """
+    label = f"{name} between samples" if part == "hold" else _LABELS.get(name, name)
+    return f"“{label}: {TEXTS.get(value, value)}”"

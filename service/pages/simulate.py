@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from sqlalchemy.orm import Session
 
 from service.control import simulate
+from service.control.closed_loop import suggest_controller
 from service.control.schemas import RunSimulationIn, RunSimulationOut, StepMetricsOut
 from service.core.errors import (
     FieldError,
@@ -21,7 +22,7 @@ from service.core.errors import (
 from service.core.validation import explain_errors
 from service.figures.csv import to_csv
 from service.figures.embed import strip_template, templates_json, to_script_json
-from service.figures.simulation import apply_units, plot_simulation
+from service.figures.simulation import apply_units, begin_near_step, plot_simulation
 from service.jobs.stored_run import StoredRun, load_run
 from service.pages.render import render_template
 from service.pages.simulate_form import (
@@ -74,6 +75,7 @@ class _FormContext:
     has_estimates: bool
     units: Mapping[str, str]
     defaults: Mapping[str, str]
+    suggested_controller: Mapping[str, str]
 
     @property
     def input_choices(self) -> list[tuple[str, str]]:
@@ -135,6 +137,8 @@ def simulate_page(
             figure, context = _simulate_query(database, store, form, wanted)
             if query.get("format") == "csv":
                 return SimulationAnswer(to_csv(figure), is_csv=True)
+            if wanted.kind == "loop":
+                begin_near_step(figure, wanted.body["control"]["reference"]["time"])
             context |= _figure_context(figure) | _request_context(form.run, wanted, base_url)
     except (ServiceError, StorageError, SysidError) as error:
         faults = [to_form_fault(fault) for fault in _to_field_errors(error)]
@@ -149,7 +153,7 @@ def simulate_page(
         values={
             **form.defaults,
             **(_shift_step_time(form.defaults) if kind == "loop" else {}),
-            **(IMPLIED_VALUES if has_request(query) else {}),
+            **(IMPLIED_VALUES if has_request(query) else form.suggested_controller),
             **query,
             **_controller_values(context.get("result")),
         },
@@ -181,7 +185,19 @@ def _load_form_context(session: Session, run_id: str, query: Mapping[str, str]) 
         has_estimates=bool(stored.estimates),
         units=_signal_units(stored, fitted),
         defaults=_default_values(stored, fitted) | _default_step(stored),
+        suggested_controller=_suggest_controller(stored),
     )
+
+
+def _suggest_controller(stored: StoredRun) -> dict[str, str]:
+    """Suggest the PI controller that SIMC tunes for the model, if it does."""
+    model, values = stored.model, {e["name"]: e["value"] for e in stored.estimates}
+    if not values or not model.inputs:
+        return {}
+    tuned = suggest_controller(model, values, model.inputs[0].name, model.outputs[0].name)
+    if tuned is None:
+        return {}
+    return {"tuning": "simc PI", **{name: f"{value:.6g}" for name, value in tuned.items()}}
 
 
 def _find_dataset(session: Session, dataset: str) -> list[Dataset]:

@@ -1,5 +1,6 @@
 """Parse the form of a simulation: its query becomes a body of the REST interface."""
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
@@ -59,6 +60,8 @@ CHOICES = {
     "anti_windup": [(name, name) for name in get_args(AntiWindup)],
 }
 """Values and texts of the controller's fields with fixed choices."""
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(e[-+]?\d+)?", re.IGNORECASE | re.ASCII)
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}", re.ASCII)
 _NUMBER_FIELDS = (
     "derivative_filter",
     "setpoint_weight",
@@ -203,17 +206,22 @@ class _QueryReader:
         return self._query.get(name, "").strip() or default
 
     def read_number(self, name: str, default: float | None = None) -> float | None:
-        """Read a number; the default if the field is empty or invalid."""
+        """Read a number; the default if the field is empty or invalid.
+
+        A decimal comma is read. ``1,000`` is refused, since it may be 1 or 1000.
+        """
         text = self.read_text(name)
         if not text:
             return default
+        is_clear = _DECIMAL_COMMA.fullmatch(text) and not _THOUSANDS.fullmatch(text)
         try:
-            value = float(text)
+            value = float(text.replace(",", ".") if is_clear else text)
         except ValueError:
             value = float("nan")
         if isfinite(value):
             return value
-        self.faults.append(FieldError(f"?{name}", f"found {text!r}; need a number"))
+        wanted = "a number with a decimal point" if "," in text else "a number"
+        self.faults.append(FieldError(f"?{name}", f"found {text!r}; need {wanted}"))
         return default
 
     def read_samples(self) -> tuple[int, float]:

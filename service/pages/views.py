@@ -15,6 +15,7 @@ from service.jobs.outcomes import is_batch
 from service.jobs.results import read_verdict
 from service.jobs.schemas import JobOut, OutcomeOut
 from service.jobs.submit import to_job_out
+from service.pages.choices import write_choice
 from service.pages.diagnostics import Diagnostics, to_diagnostics
 from service.pages.result_view import (
     EstimateView,
@@ -24,6 +25,7 @@ from service.pages.result_view import (
     to_posterior_views,
 )
 from service.storage.tables import Event, Job, Run
+from sysid.core.text import rewrite_settings
 
 Document = Mapping[str, Any]
 
@@ -156,7 +158,7 @@ def to_run_view(
         unit=unit,
         estimates=[to_estimate_view(parameter) for parameter in result.get("parameters", ())],
         verdict=read_verdict(result) if result else None,
-        warnings=result.get("warnings", ()),
+        warnings=[rewrite_settings(note, write_choice) for note in result.get("warnings", ())],
         tags=run.tags or (),
         etag=compute_etag(run),
         has_signals=run.state is JobState.SUCCEEDED,

@@ -5,8 +5,6 @@ from typing import Any
 
 from service.core.errors import FieldError, InvalidRequest
 from service.core.settings import Settings
-from service.core.text import name_label
-from service.core.text_checks import find_text_fault
 from service.items.reference_names import REFERENCE_PREFIX, RUN_PREFIX
 from service.jobs import submit
 from service.jobs.schemas import PREVIOUS, JobIn, JobOut
@@ -73,20 +71,12 @@ def build_job(body: ReidentifyIn, order: list[int]) -> JobIn:
     return JobIn.model_validate(
         {
             **body.job_fields,
-            "name": body.name
-            or f"{_choose_model_name(body.model)} over {name_label(body.label)}"[:200],
             "datasets": chosen[0].datasets,
             "sweep": {"axes": [axis]},
             "warm_start": _choose_warm_start(body, reference),
             "trend": trend,
         }
     )
-
-
-def _choose_model_name(model: Any) -> str:
-    """Choose the model's name for the batch. An invalid text is reported with the model."""
-    name = model.get("name") if isinstance(model, dict) else model
-    return name if isinstance(name, str) and find_text_fault(name) is None else "model"
 
 
 def _to_job_reference(reference: str | None) -> str | None:

@@ -186,7 +186,7 @@ def factor_transfer_function(
     if is_difference(identified.model):
         raise _make_refusal(
             "a tuning rule needs a model in the differential form, and this one is a recursion. "
-            "Give gain, integral_time and derivative_time yourself."
+            "Set the gain and the times by hand."
         )
     try:
         pairs = compute_transfer_functions(identified).pairs

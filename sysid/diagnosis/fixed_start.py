@@ -38,7 +38,6 @@ from sysid.simulation.metrics import compute_mean
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
-from sysid.uncertainty.sensitivities import compute_sensitivities
 
 _SIGNIFICANCE = 1e-4  # of the likelihood ratio
 _UNLIKELY_DISTANCE = 2.0  # half 95 % intervals of a free start from the fixed one
@@ -122,13 +121,11 @@ def _predict_starts(
     """Predict the moves (E,) of each state's starts that would reduce the loss significantly."""
     if not _get_assumed_starts(problem):
         return {}
-    if analysis.residuals_and_sensitivities is None:  # whitened
-        sensitivities = compute_sensitivities(problem, theta)
-        error, columns = sensitivities.residuals, sensitivities.columns
-    else:
-        error, columns = analysis.residuals_and_sensitivities
-    known = None if analysis.residuals_and_sensitivities is None else analysis.decomposition
-    left, _, _, retained = compute_truncated_svd(columns) if known is None else known
+    if analysis.residuals_and_sensitivities is None:  # no simulations were left for them
+        return {}
+    error, columns = analysis.residuals_and_sensitivities
+    known = None if analysis.is_whitened else analysis.decomposition
+    left, _, _, retained = known or compute_truncated_svd(columns)
     basis = left[:, retained]
     rest = error - basis @ (basis.T @ error)
     loss = float(rest @ rest)

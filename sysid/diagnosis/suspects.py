@@ -1,14 +1,15 @@
 """Suspects: what may have left residuals that are not noise, compared by likelihood.
 
-Drift, a step disturbance, a wrong start, outliers, a sensor at its limit, coloured noise and
-missing dynamics look alike to a test of whiteness. So each is fitted to the residuals together with
-the linear model of the outputs, which costs no simulation. The largest gain names the suspect:
+Drift, a step disturbance, a wrong start, outliers, a sensor at its limit or stuck, coloured noise
+and missing dynamics look alike to a test of whiteness. So each is fitted to the residuals together
+with the linear model of the outputs, which costs no simulation. The largest gain names the suspect:
 
     gain = n ln(Σe²₀/Σe²) − q ln n
 
 with the sums of squares before and after, and q parameters, of which the place of a step counts as
 one (Schwarz 1978). Outliers are compared by the likelihood of Student's t, slow noise by that of
 a first-order process. Samples at a limit are left out: any value beyond it gives the same reading.
+So are runs of equal readings, where a reading otherwise differs from the one before.
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,6 +39,8 @@ _NOISE_SHARE = 0.5  # of its likelihood gain
 _TAIL_DEGREES = 3.0  # of Student's t
 _MIN_LIMIT_SAMPLES = 5  # at the largest or smallest value
 _LIMIT_SHARE = 0.02  # of the samples
+_STUCK_SAMPLES = 10  # equal readings in a row
+_MOVING = 0.7  # of the other readings: they differ from those before
 _ONE_SIDED = 0.8  # of the residuals at a limit: the model is beyond it
 
 
@@ -62,17 +65,21 @@ DYNAMICS = "dynamics that the model lacks"
 def find_suspects(problem: Problem, analysis: Analysis, *, are_white: bool) -> list[Suspect]:
     """Find what explains the residuals of least squares, the most likely first.
 
-    White residuals are searched for outliers and limits only.
+    White residuals are searched for single values only, such as outliers. Beside a noise model,
+    which follows any course, only those count that the measurement itself shows.
     """
     if analysis.residuals_and_sensitivities is None or problem.loss_scale:
         return []
     error, columns = analysis.residuals_and_sensitivities
     if not np.any(error) or error.size < max(_MIN_SAMPLES, 2 * columns.shape[1]):
         return []
-    left, _, _, retained = analysis.decomposition or compute_truncated_svd(columns)
+    known = None if analysis.is_whitened else analysis.decomposition
+    left, _, _, retained = known or compute_truncated_svd(columns)
     fit = _LinearFit(problem, error, left[:, retained])
     suspects = [one for part in iterate_parts(problem) for one in fit.list_values(part)]
-    if not are_white:
+    if analysis.is_whitened:
+        suspects = [one for one in suspects if one.is_seen]
+    elif not are_white:
         suspects += [one for part in iterate_parts(problem) for one in fit.list_courses(part)]
         suspects.append(fit.fit_dynamics())
     clear = (one for one in suspects if one.gain > _MIN_GAIN)
@@ -84,6 +91,14 @@ def describe_suspects(suspects: Sequence[Suspect]) -> str:
     first, *others = suspects
     other = next((f"; {one.name}: {one.gain:.0f}" for one in others if one.name != first.name), "")
     return f"most likely of {first.name} (likelihood gain {first.gain:.0f}{other}). {first.cure}"
+
+
+@dataclass(frozen=True, slots=True)
+class _LeftOut:
+    """Residuals of samples that were left out, and the likelihood gain of the others."""
+
+    left_out: FloatArray
+    gain: float
 
 
 class _LinearFit:
@@ -101,7 +116,8 @@ class _LinearFit:
             sizes = np.abs(self._error[part.rows])
             if np.max(sizes) > _OUTLYING * 1.4826 * float(np.median(sizes)):
                 yield self._fit_tails(part, where)
-            yield from self._leave_out_limit(part, where)
+            at_limit = list(self._leave_out_limit(part, where))
+            yield from at_limit or self._leave_out_stuck(part, where)
 
     def list_courses(self, part: ResidualPart) -> Iterator[Suspect]:
         """List what the course of one output of one experiment may show."""
@@ -196,32 +212,60 @@ class _LinearFit:
 
     def _leave_out_limit(self, part: ResidualPart, where: str) -> Iterator[Suspect]:
         """Leave samples at the largest or the smallest value out, if the model is beyond it."""
-        rows = self._problem.scored_rows[part.rows]
-        measured = self._problem.evaluator.measured[rows]
+        measured = self._problem.evaluator.measured[self._problem.scored_rows[part.rows]]
         for limit, side in ((np.max(measured), 1.0), (np.min(measured), -1.0)):
             at_limit: BoolArray = measured == limit
             count = int(np.count_nonzero(at_limit))
             if count < max(_MIN_LIMIT_SAMPLES, _LIMIT_SHARE * measured.size):
                 continue
-            free = np.ones(self._error.size, dtype=np.bool_)
-            free[part.rows] = ~at_limit
-            if np.count_nonzero(free) <= self._basis.shape[1]:
+            found = self._leave_out(part, at_limit)
+            if found is None or np.mean(side * found.left_out > 0) < _ONE_SIDED:
                 continue
-            move = np.linalg.lstsq(self._basis[free], self._error[free], rcond=None)[0]
-            left = self._error - self._basis @ move
-            if np.mean(side * left[~free] > 0) < _ONE_SIDED:
-                continue
-            n, power = self._error.size, float(np.mean(np.square(left[free])))
-            gain = n * log(self._power / n / max(power, 1e-300)) - log(n)
-            unit = format_unit(
-                next(one.unit for one in self._problem.model.outputs if one.name == part.output)
-            )
             yield Suspect(
-                f"a sensor at its limit: {where} is {limit:.4g}{unit} in {count} samples",
-                gain,
+                f"a sensor at its limit: {where} is {self._format(part, limit)} in {count} samples",
+                found.gain,
                 "Leave these samples out: empty cells are not compared",
                 is_seen=True,
             )
+
+    def _leave_out_stuck(self, part: ResidualPart, where: str) -> Iterator[Suspect]:
+        """Leave long runs of equal readings out, if the others move from sample to sample."""
+        measured = self._problem.evaluator.measured[self._problem.scored_rows[part.rows]]
+        moves = np.concatenate([[True], np.diff(measured) != 0])
+        starts = np.flatnonzero(moves)
+        lengths = np.diff(np.append(starts, measured.size))
+        stuck = np.repeat(lengths >= _STUCK_SAMPLES, lengths)
+        if not stuck.any() or stuck.all() or np.mean(moves[~stuck]) < _MOVING:
+            return
+        found = self._leave_out(part, stuck)
+        if found is None:
+            return
+        first = starts[lengths >= _STUCK_SAMPLES][0]
+        value, moment = float(measured[first]), float(part.times[first])
+        yield Suspect(
+            f"a sensor that is stuck: {where} repeats its value in "
+            f"{np.count_nonzero(stuck)} samples, such as {self._format(part, value)} from "
+            f"{moment:.4g} s",
+            found.gain,
+            "Leave these samples out: empty cells are not compared",
+            is_seen=True,
+        )
+
+    def _leave_out(self, part: ResidualPart, samples: BoolArray) -> _LeftOut | None:
+        """Fit without some samples of a part; None if too few are left."""
+        free = np.ones(self._error.size, dtype=np.bool_)
+        free[part.rows] = ~samples
+        if np.count_nonzero(free) <= self._basis.shape[1]:
+            return None
+        move = np.linalg.lstsq(self._basis[free], self._error[free], rcond=None)[0]
+        left = self._error - self._basis @ move
+        n, power = self._error.size, float(np.mean(np.square(left[free])))
+        return _LeftOut(left[~free], n * log(self._power / n / max(power, 1e-300)) - log(n))
+
+    def _format(self, part: ResidualPart, value: float) -> str:
+        outputs = self._problem.model.outputs
+        unit = next(one.unit for one in outputs if one.name == part.output)
+        return f"{value:.4g}{format_unit(unit)}"
 
     def _pad(self, part: ResidualPart, values: FloatArray) -> FloatArray:
         padded = np.zeros(self._error.size)

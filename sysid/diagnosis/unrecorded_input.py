@@ -79,10 +79,11 @@ def _find_moves(problem: Problem, analysis: Analysis, assumed: BoolArray) -> lis
     """Find the estimates that move without the assumed samples (n,), and describe the moves."""
     if (
         analysis.residuals_and_sensitivities is None
+        or analysis.is_whitened
         or analysis.linear_model is None
         or problem.prediction != "simulation"
     ):
-        return []  # whitened, or not of squares
+        return []  # not of plain squares
     if analysis.is_cut_short:
         return []  # the time is over
     if not all(isinstance(initial, EstimatedInitial) for initial in problem.model.initial):

@@ -164,7 +164,7 @@ def compute_growth(problem: Problem, theta: FloatArray) -> float:
 
 
 def _are_white(problem: Problem, analysis: Analysis) -> bool:
-    if analysis.residuals_and_sensitivities is None:
+    if analysis.residuals_and_sensitivities is None or analysis.is_whitened:
         return False
     error = analysis.residuals_and_sensitivities[0]
     return not any(is_coloured(part, error[part.rows]) for part in iterate_parts(problem))

@@ -6,7 +6,7 @@ same. A new kind of reason is a function of the evidence in `_FINDERS`.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import isfinite, isnan
 from typing import TYPE_CHECKING, Literal, TypeGuard
 
 from sysid.core.text import plain_estimate, plain_unit
@@ -82,6 +82,7 @@ class Evidence:
     valid : bool
         Whether the RMS is below the safe limit.
     fit_percent, fit_percent_validation : float or None
+        ``nan`` for a constant output. None in results that do not say.
     search : SearchEvidence or None
         None in results that do not say.
     tests : sequence of ResidualTest
@@ -155,6 +156,16 @@ def conclude_verdict(reasons: Sequence[Reason]) -> Verdict:
 def _find_invalid(evidence: Evidence) -> Iterator[Reason]:
     if not evidence.valid:
         yield Reason("serious", "the model is invalid", "The RMS error is above the safe limit.")
+
+
+def _find_constant_output(evidence: Evidence) -> Iterator[Reason]:
+    if evidence.fit_percent is not None and isnan(evidence.fit_percent):
+        yield Reason(
+            "serious",
+            "the output is constant",
+            "The output does not move, so it tells nothing of the model. Choose another channel, "
+            "or a recording in which it moves.",
+        )
 
 
 def _find_unsettled(evidence: Evidence) -> Iterator[Reason]:
@@ -302,8 +313,8 @@ def _find_missing_dynamics(evidence: Evidence) -> Iterator[Reason]:
         yield Reason(
             "caution",
             "the residuals are not noise",
-            "The residuals are not white, and a model of another order does not explain them. A "
-            "warning names what they are most likely of.",
+            "The residuals are not white, and a model of another order does not explain them. Look "
+            "for a disturbance, slow noise, or a system that changed during the recording.",
         )
     elif evidence.has_failed("whiteness"):
         names = evidence.delays
@@ -353,6 +364,7 @@ def _find_insignificant_delays(evidence: Evidence) -> Iterator[Reason]:
 
 _FINDERS: tuple[Callable[[Evidence], Iterator[Reason]], ...] = (
     _find_invalid,
+    _find_constant_output,
     _find_unsettled,
     _find_no_fit,
     _find_misled_run,

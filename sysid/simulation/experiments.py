@@ -131,13 +131,12 @@ def _compute_reciprocal_deviation(name: str, records: Sequence[Record], skip: in
             f"output {name!r} has no value after the first {skip} samples, so the fit has no data. "
             "Use a smaller skip or a longer record"
         )
-    deviation = float(np.std(finite))
-    if deviation == 0.0:
+    if np.ptp(finite) == 0.0:
         raise InvalidRecord(
             f"output {name!r} is constant, so its standard deviation gives no weight. "
             "Set the weights of the outputs"
         )
-    return 1.0 / deviation
+    return 1.0 / float(np.std(finite))
 
 
 def place_on_grid(

@@ -23,9 +23,9 @@ def compute_fit_percent(measured: FloatArray, simulated: FloatArray) -> float:
 
     ``nan`` for a constant measurement, for which the ratio is undefined.
     """
-    spread = float(np.linalg.norm(measured - compute_mean(measured)))
-    if spread == 0.0:
+    if np.ptp(measured) == 0.0:  # equal values may differ from their mean by a rounding
         return float("nan")
+    spread = float(np.linalg.norm(measured - compute_mean(measured)))
     return 100.0 * (1.0 - float(np.linalg.norm(measured - simulated)) / spread)
 
 

@@ -98,8 +98,10 @@ class Analysis:
     """Whether the time limit prevented the search for minima near the estimate."""
     residuals_and_sensitivities: tuple[FloatArray, FloatArray] | None = None
     """Residuals (n,) and sensitivities (n, D), not whitened."""
+    is_whitened: bool = False
+    """Whether all else is of whitened residuals and sensitivities, under a noise model."""
     decomposition: TruncatedSvd | None = None
-    """Of these sensitivities; of the whitened ones under a noise model. None: no uncertainty."""
+    """Of the sensitivities, whitened or not. None: no uncertainty."""
     likelihood: LikelihoodModel | None = None
     """None if there is no uncertainty."""
 
@@ -119,17 +121,14 @@ def analyse_estimate(
         sensitivities = compute_sensitivities(problem, theta, max_simulations)
     except BudgetSpentError as spent:
         return _analyse_without_sensitivities(problem, theta, spent, whitening)
+    plain = sensitivities.residuals, sensitivities.columns
     if whitening is not None:
         columns = np.ascontiguousarray(whitening.whiten(sensitivities.columns.T).T)
         sensitivities = sensitivities._replace(
             residuals=whitening.whiten(sensitivities.residuals), columns=columns
         )
     analysis = _analyse_sensitivities(problem, theta, sensitivities, max_simulations, whitening)
-    if whitening is not None:
-        return analysis
-    return replace(
-        analysis, residuals_and_sensitivities=(sensitivities.residuals, sensitivities.columns)
-    )
+    return replace(analysis, residuals_and_sensitivities=plain, is_whitened=whitening is not None)
 
 
 def _analyse_without_sensitivities(

@@ -297,7 +297,7 @@ def _result(rms: float = SIGMA) -> dict[str, Any]:
                 "reason": "",
             }
         ],
-        "warnings": ["T and L are strongly correlated (−0.78): T + L is better known than either"],
+        "warnings": ["T and L have the correlation −0.78: T + L is better known than either"],
     }
 
 

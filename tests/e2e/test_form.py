@@ -48,15 +48,17 @@ def test_an_unknown_name_in_an_equation_is_told_with_its_column(site: Site, page
     check = page.locator("#check")
     expect(check).to_contain_text("column 2")
     expect(check).to_contain_text("Kp")
+    expect(page.locator("#about-model")).to_be_hidden()  # it has the equations of before
     write_own(page, EQUATIONS)
     expect(check).to_contain_text("the model is valid")
+    expect(page.get_by_role("math", name="dy/dt = (K*u(t - L) - y)/T")).to_be_visible()
 
 
 def test_own_equations_are_submitted_with_bounds_and_channels(own_site: Site, page: Page) -> None:
     opened(own_site, page, f"?dataset={own_site.filled.dataset}")
     write_own(page, EQUATIONS)
     expect(page.locator("#check")).to_contain_text("the model is valid")
-    page.get_by_label("upper of L").fill("0.3")
+    page.get_by_label("upper of L").fill("0,3")
     page.get_by_label("output y").select_option("P2")
     page.get_by_label("u between samples").select_option("zero")
     page.get_by_label("noise").select_option("ar1")
@@ -91,6 +93,14 @@ def test_a_refused_request_is_told_at_the_field(site: Site, page: Page) -> None:
     expect(page.get_by_label("population")).to_be_focused()
 
 
+def test_a_comma_that_may_separate_thousands_is_refused_with_advice(site: Site, page: Page) -> None:
+    opened(site, page, f"?dataset={site.filled.dataset}")
+    page.get_by_label("upper of T").fill("1,000")
+    page.get_by_role("button", name="Identify").click()
+    expect(page.get_by_label("upper of T")).to_have_attribute("aria-invalid", "true")
+    expect(page.locator('[data-fault="/parameters"]')).to_contain_text("write a decimal point")
+
+
 def test_swapped_bounds_are_marked_both_and_told_once(site: Site, page: Page) -> None:
     opened(site, page, f"?dataset={site.filled.dataset}")
     write_own(page, EQUATIONS)
@@ -110,7 +120,7 @@ def test_a_csv_file_is_stored_and_chosen(own_site: Site, page: Page, tmp_path: P
     path.write_text("t [s],u [V],y [V]\n" + "".join(f"{n / 10},{n % 2},{n}\n" for n in range(20)))
     opened(own_site, page)
     page.get_by_label("or upload a recording").set_input_files(path)
-    expect(page.locator("#form-state")).to_contain_text("step.csv is stored")
+    expect(page.locator("#upload-state")).to_contain_text("step.csv is stored")
     expect(page.locator("#dataset-facts")).to_have_text("u [V] · y [V]")
 
 
@@ -134,8 +144,8 @@ def test_a_file_without_times_is_stored_with_its_sampling_period(
     expect(page.locator('[data-fault="/datasets"]')).to_contain_text('field "sampling period"')
     page.get_by_label("sampling period [s]").fill("0.1")
     page.get_by_label("sampling period [s]").blur()
-    expect(page.locator("#form-state")).to_contain_text("notime.csv is stored")
-    expect(page.locator("#form-state")).to_contain_text("decimal commas")
+    expect(page.locator("#upload-state")).to_contain_text("notime.csv is stored")
+    expect(page.locator("#upload-state")).to_contain_text("decimal commas")
     expect(page.locator('[data-fault="/datasets"]')).to_be_empty()
 
 
@@ -154,6 +164,25 @@ def test_a_clone_starts_from_the_request_of_the_job(own_site: Site, page: Page) 
             jobs.get(name).spec for name in (own_site.filled.finished, page.url.rsplit("/", 1)[1])
         ]
     assert specs[0] == specs[1]
+
+
+def test_a_clone_of_a_job_that_the_service_named_is_named_after_its_new_model(
+    own_site: Site, page: Page
+) -> None:
+    model = yaml.safe_load(EQUATIONS)
+    body = {"model": model, "datasets": [own_site.filled.dataset]}
+    body |= {"channels": {"u": "P1", "y": "P2"}}
+    answer = httpx.post(f"{own_site.url}/v1/jobs", json=body, timeout=LIMIT_SECONDS).json()
+    assert answer["name"] == "my-tube on tube 40 m"
+    opened(own_site, page, f"?clone={answer['id']}")
+    name = page.get_by_label("name of the job")
+    expect(name).to_have_attribute("placeholder", answer["name"])
+    write_own(page, EQUATIONS.replace("my-tube", "longer-tube"))
+    expect(name).to_have_attribute("placeholder", "longer-tube on tube 40 m")
+    expect(name).to_have_value("")
+    page.get_by_role("button", name="Identify").click()
+    page.wait_for_url(re.compile(r"/jobs/job_"))
+    expect(page.locator("h1")).to_have_text("longer-tube on tube 40 m")
 
 
 def test_a_clone_keeps_starts_scales_and_ties(own_site: Site, page: Page) -> None:
@@ -231,7 +260,7 @@ def test_a_file_is_dropped_on_the_page(own_site: Site, page: Page) -> None:
           document.dispatchEvent(new DragEvent('drop', {dataTransfer: files, bubbles: true}));
         }"""
     )
-    expect(page.locator("#form-state")).to_contain_text("dropped.csv is stored")
+    expect(page.locator("#upload-state")).to_contain_text("dropped.csv is stored")
     expect(page.locator("#dataset-facts")).to_have_text("u · y")
 
 

@@ -120,13 +120,13 @@ def test_an_upload_that_ends_late_neither_selects_itself_nor_reports(
         uploads.let_go()
         expect(facts).to_contain_text("P1")
         expect(page.locator('[data-fault="/datasets"]')).to_be_empty()
-        expect(page.locator("#form-state")).to_be_empty()
+        expect(page.locator("#upload-state")).to_be_empty()
     page.get_by_label("or upload a recording").set_input_files(bad)
     uploads.wait()
     page.get_by_label("or upload a recording").set_input_files(good)
     uploads.let_go()
     uploads.let_go()
-    expect(page.locator("#form-state")).to_contain_text("good.csv is stored")
+    expect(page.locator("#upload-state")).to_contain_text("good.csv is stored")
     expect(page.locator('[data-fault="/datasets"]')).to_be_empty()
 
 

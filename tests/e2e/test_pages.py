@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from typing import Literal
 
 import pytest
 from playwright.sync_api import Page, expect
@@ -10,6 +11,7 @@ from service.core.states import JobState
 from service.queue.leases import LeaseQueue
 from service.queue.queue_state import read_queue_state
 from service.repositories.jobs import JobRepository
+from sysid.figures.theme import plotly_template
 from tests.e2e.conftest import Site
 from tests.e2e.filled import TRUE, end_running, progress
 
@@ -68,7 +70,7 @@ def test_a_finished_job_shows_its_estimates_plots_and_residual_tests(
     assert page.locator(f"{corner} .barlayer .trace").count() == 3
     expect(page.locator("table.posterior tbody tr").nth(1)).to_contain_text("1\u202f712")
     assert page.evaluate(height) == before  # plots take the room that was left for them
-    expect(page.get_by_text("strongly correlated")).to_be_visible()
+    expect(page.get_by_text("have the correlation −0.78")).to_be_visible()
     assert_residual_tests(page)
     assert red_of(page) <= 128  # dark letters on a light page
     assert [url for url in asked if url.endswith("/events")] == []  # nothing more is to come
@@ -119,57 +121,54 @@ def test_plots_of_a_finished_job_follow_the_keyboard_the_scheme_and_the_wish_for
     assert page.locator(f"[data-profile-plot] {LINES}").count() == len(TRUE)
 
 
-def test_a_printed_page_has_every_figure_and_each_is_saved_as_an_image(
+def test_a_page_hides_its_buttons_on_paper_and_each_figure_is_saved_as_an_image(
     site: Site, scripted_page: Page
 ) -> None:
     page = scripted_page
-    page.add_init_script("window.print = () => { window.sheets = document.body.className; }")
     page.goto(f"{site.url}/jobs/{site.filled.finished}")
-    page.keyboard.press("Control+p")
-    page.wait_for_function("() => window.sheets === 'printing'")
-    figures = page.locator("[data-figure]")
-    expect(page.locator("[data-figure].js-plotly-plot")).to_have_count(figures.count())
-    assert figures.evaluate_all(
-        "plots => plots.every(plot => plot.querySelector('.main-svg').clientWidth <= 720)"
-    )
     page.emulate_media(media="print")
     expect(page.locator("details.request")).to_be_hidden()
     page.emulate_media(media="screen")
-    page.evaluate("() => dispatchEvent(new Event('afterprint'))")
+    figure(page, "response")
     for kind in ("SVG", "PNG"):
         with page.expect_download() as saved:
             page.get_by_role("button", name=f"Measured against identified as {kind}").click()
         assert saved.value.suggested_filename == f"response.{kind.lower()}"
 
 
-def test_what_the_menu_of_the_browser_prints_has_every_figure_within_the_sheet(
-    site: Site, page: Page
-) -> None:
-    page.emulate_media(color_scheme="light")
-    page.goto(f"{site.url}/jobs/{site.filled.finished}")
-    figures = page.locator("[data-figure]")
-    drawn = page.locator("[data-figure].js-plotly-plot")
-    expect(drawn).to_have_count(figures.count())  # without scrolling
+def count_printed(page: Page) -> int:
+    """Print a page; count its figures, all of which are light and within the sheet."""
     page.evaluate(
-        "() => addEventListener('beforeprint', () => { window.widths = "
-        "[...document.querySelectorAll('.main-svg')].map(svg => svg.getBoundingClientRect().width)"
-        " })"
+        "() => addEventListener('beforeprint', () => { window.sheet = "
+        "[...document.querySelectorAll('[data-figure], [data-source]')].map(plot => "
+        "[plot.querySelector('.main-svg')?.getBoundingClientRect().width ?? null, "
+        "plot.layout?.template.layout.font.color]) })"
     )
     page.pdf(format="A4")
-    widths = page.evaluate("window.widths")
-    assert len(widths) >= figures.count()
-    assert max(widths) <= 720
-    page.wait_for_function("() => !document.body.classList.contains('printing')")
+    sheet = page.evaluate("window.sheet")
+    assert [width for width, _ in sheet if not 0 < width <= 720] == []
+    assert {colour for _, colour in sheet} == {plotly_template("light")["layout"]["font"]["color"]}
+    return len(sheet)
 
 
-def test_what_was_not_drawn_yet_is_fetched_before_the_page_is_printed(
-    site: Site, page: Page
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("is_drawn", [False, True], ids=["at once", "drawn"])
+def test_a_printed_page_has_every_figure_in_light_colours_within_the_sheet(
+    site: Site, page: Page, scheme: Literal["light", "dark"], is_drawn: bool
 ) -> None:
-    page.emulate_media(color_scheme="light")
-    page.goto(f"{site.url}/jobs/{site.filled.finished}", wait_until="domcontentloaded")
-    page.wait_for_function("() => window.Plotly")
-    with page.expect_request(re.compile("figures/waterfall"), timeout=1500):
-        page.evaluate("() => dispatchEvent(new Event('beforeprint'))")
+    page.emulate_media(color_scheme=scheme)
+    page.goto(f"{site.url}/jobs/{site.filled.finished}", wait_until="load")
+    names = page.eval_on_selector_all("[data-figure]", "plots => plots.map(p => p.dataset.figure)")
+    for name in names if is_drawn else []:
+        figure(page, name)
+    assert count_printed(page) == len(names)
+    page.wait_for_function("() => !document.body.classList.contains('printing')")
+    ink = plotly_template(scheme)["layout"]["font"]["color"]
+    page.wait_for_function(
+        "ink => [...document.querySelectorAll('[data-figure]')]"
+        ".every(plot => plot.layout.template.layout.font.color === ink)",
+        arg=ink,
+    )
 
 
 def test_runs_are_compared_side_by_side(site: Site, page: Page) -> None:
@@ -255,7 +254,7 @@ def test_the_result_appears_when_a_running_job_ends(own_site: Site, page: Page) 
     expect(lineage).to_have_text("Drawn when the job has ended.")
     end_running(own_site.parts.database, own_site.parts.store, own_site.filled.lease)
     expect(page.locator("table.estimates tbody tr")).to_have_count(len(TRUE))
-    expect(lineage.get_by_role("link", name="run run 1 of")).to_have_count(1)
+    expect(lineage.get_by_role("link", name="run 1 of")).to_have_count(1)
     expect(page.locator("#job .chip")).to_have_text("succeeded")
     expect(page.locator("[data-announcement]")).to_have_text("succeeded: trustworthy")
     assert page.locator(f"{figure(page, 'response')} {LINES}").count() == 8
@@ -371,20 +370,27 @@ def test_the_report_is_drawn_without_a_server(site: Site, page: Page) -> None:
     answer = page.request.get(f"{site.url}/v1/jobs/{site.filled.finished}/report")
     assert answer.ok
     page.route("**/*", lambda route: route.abort())
+    page.emulate_media(color_scheme="dark")
     page.set_content(answer.text())
     page.wait_for_selector(".plot .main-svg")
     assert page.locator(".js-plotly-plot").count() == 7
     expect(page.locator('.modebar-btn[data-title^="Share"]')).to_have_count(0)
     expect(page.locator("table.estimates tbody tr")).to_have_count(len(TRUE))
+    assert count_printed(page) == 7
 
 
 def test_a_run_is_simulated_in_a_closed_loop_from_its_page(site: Site, page: Page) -> None:
     page.goto(f"{site.url}/jobs/{site.filled.finished}")
     page.get_by_role("link", name="Simulate").click()
+    expect(page.get_by_label("tuning")).to_have_value("simc PI")
     page.get_by_label("gain").first.fill("0.5")
+    page.get_by_label("integral time").fill("")
     page.get_by_label("height").fill("10")
     page.get_by_role("button", name="Simulate").click()
     page.wait_for_selector("#result .main-svg")
+    expect(page.get_by_role("heading", name="Response")).to_be_focused()
+    expect(page.get_by_role("heading", name="Response")).to_be_in_viewport()
+    expect(page.get_by_label("tuning")).to_have_value("by hand")
     expect(page.locator("#result .verdict")).to_have_text("settles")
     assert page.locator(f"#result {LINES}").count() == 3  # reference, output and input
     address = page.url
@@ -428,6 +434,7 @@ def test_a_wrong_gain_is_told_at_its_field(site: Site, page: Page) -> None:
     page.get_by_label("gain").first.fill("much")
     page.get_by_role("button", name="Simulate").click()
     expect(page.get_by_role("alert")).to_contain_text("gain: found 'much'; need a number")
+    expect(page.get_by_role("alert")).to_be_focused()
     expect(page.locator("[name=gain]")).to_have_attribute("aria-invalid", "true")
 
 
@@ -437,6 +444,24 @@ CUT_TABLES = """boxes => boxes.filter((box) => box.checkVisibility()).filter((bo
 ).map((box) => box.innerText)"""
 """Tables that are cut at the window's edge, or hide a cell."""
 PATHS = ["/", "/docs", "/datasets", "/jobs/{failed}", "/jobs/{sweep}", "/datasets/{dataset}"]
+
+
+def test_the_menu_of_a_narrow_page_is_opened_by_the_keyboard(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/health")
+    models = page.get_by_role("navigation", name="Main").get_by_role("link", name="Models")
+    expect(models).to_be_visible()
+    expect(page.get_by_text("Menu", exact=True)).to_be_hidden()
+    page.set_viewport_size({"width": 390, "height": 900})
+    expect(models).to_be_hidden()
+    head = page.locator(".top").bounding_box()
+    assert head is not None
+    assert head["height"] < 60  # one line
+    for key in ("Tab", "Tab", "Tab", "Enter"):  # the skip link, the brand, the menu
+        page.keyboard.press(key)
+    expect(models).to_be_visible()
+    for _ in range(4):
+        page.keyboard.press("Tab")
+    expect(models).to_be_focused()
 
 
 def test_a_narrow_page_does_not_overflow_and_its_headings_are_in_order(

@@ -70,6 +70,9 @@ def test_faults_of_a_sweep_stand_at_their_fields(own_site: Site, page: Page) -> 
     page.get_by_role("button", name="Sweep").click()
     expect(page.locator('[data-fault="/sigma"]')).to_contain_text("tenth")
     expect(page.get_by_label("σ, as a list")).to_have_attribute("aria-invalid", "true")
+    page.get_by_label("σ, as a list").fill("0,05 0,1")
+    page.get_by_role("button", name="Sweep").click()
+    expect(page.locator('[data-fault="/sigma"]')).to_contain_text("semicolons between numbers")
     page.get_by_label("σ, as a list").fill("0, 0.1")
     page.get_by_role("button", name="Sweep").click()
     told = page.locator('[data-fault="/truth"]')
@@ -84,7 +87,7 @@ def test_a_sweep_of_a_recording_says_that_it_adds_the_runs_without_noise(
 ) -> None:
     page.goto(f"{own_site.url}/new/noise-sweep?dataset={own_site.filled.dataset}")
     page.locator("[name=model]").select_option("fopdt")
-    page.get_by_label("σ, as a list").fill("1, 2")
+    page.get_by_label("σ, as a list").fill("1; 2,5")
     page.get_by_label("replicates").fill("2")
     expect(page.locator("#runs-count")).to_have_text(
         "2 σ × 2 replicates × 2 methods = 8 runs, and 4 at σ = 0 as the reference of the errors"
@@ -94,6 +97,7 @@ def test_a_sweep_of_a_recording_says_that_it_adds_the_runs_without_noise(
     spec = spec_of(own_site, page)
     expect(page.locator("#job")).to_contain_text("0 of 12 runs")
     assert spec["datasets"] == [own_site.filled.dataset]
+    assert [0.0, 1.0, 2.5] in [axis["values"] for axis in spec["sweep"]["axes"]]  # type: ignore[index]
     assert spec["channels"] == {"u": "P1", "y": "P2"}
 
 

@@ -26,16 +26,28 @@ def sentences(markdown: str, ends: str = ".!?:") -> list[str]:
     return [part for part in parts if len(part.split()) > 2]
 
 
+def sentences_of_cells(markdown: str) -> list[str]:
+    """Sentences of the cells of tables; a piece of code counts as a word."""
+    prose = re.sub(r"```.*?```", "", markdown, flags=re.DOTALL)
+    rows = re.findall(r"^\s*\|.*$", prose, re.MULTILINE)
+    text = re.sub(r"`[^`]*`", "X", "\n".join(rows))
+    return re.split(r"(?<=[.!?:;])\s+|\||\n", text)
+
+
 def test_a_long_sentence_is_seen() -> None:
     long = " ".join(["word"] * 26) + "."
     assert [len(one.split()) for one in sentences(f"# Title\n\nShort one here. {long}\n")] == [
         3,
         26,
     ]
+    cells = sentences_of_cells(f"| `a b` | {long} |\n|---|---|\n| short; {long} | |\n")
+    assert [len(one.split()) for one in cells if len(one.split()) > MAX_WORDS] == [26, 26]
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_sentences_of_documents_are_short(path: Path) -> None:
+    cells = sentences_of_cells(path.read_text())
+    assert [one for one in cells if len(one.split()) > MAX_WORDS] == []
     lengths = {one: len(one.split()) for one in sentences(path.read_text())}
     assert {one: count for one, count in lengths.items() if count > MAX_WORDS} == {}
     whole = sentences(path.read_text(), ends=".!?")

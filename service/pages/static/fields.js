@@ -2,6 +2,7 @@
 
 import { Problem, address, makeElement, post } from './live.js';
 
+const COMMA_HINT = 'A comma can be read in two ways: write a decimal point, and semicolons between numbers.';
 const COLUMNS = ['lower', 'upper', 'fixed'];
 const rows = document.getElementById('parameters');
 let hiddenChanges = {}; // requested changes without a field
@@ -64,14 +65,27 @@ export function showProposals(proposals) {
   }
 }
 
+const DECIMAL_COMMA = /^[-+]?\d*,\d+(e[-+]?\d+)?$/i;
+const THOUSANDS = /^[-+]?[1-9]\d{0,2},\d{3}$/;
+
+/**
+ * Parse a number with a decimal point or comma. Other text is sent as typed, so that the server
+ * reports the fault. Such a text is 1,000, which may be 1 or 1000.
+ */
+export function parseNumber(text) {
+  const typed = text.trim();
+  const isClear = DECIMAL_COMMA.test(typed) && !THOUSANDS.test(typed);
+  const number = Number(isClear ? typed.replace(',', '.') : typed);
+  return typed === '' ? null : Number.isNaN(number) ? typed : number;
+}
+
 /** Read what differs from the model, as the job body has it. */
 export function readOverrides() {
   const changes = structuredClone(hiddenChanges);
   for (const input of rows.querySelectorAll('input')) {
     const text = input.value.trim();
     if (text === '' || text === input.dataset.bound) continue;
-    const value = Number.isNaN(Number(text)) ? text : Number(text);
-    (changes[input.dataset.parameter] ??= {})[input.dataset.column] = value;
+    (changes[input.dataset.parameter] ??= {})[input.dataset.column] = parseNumber(text);
   }
   return changes;
 }
@@ -115,7 +129,8 @@ function markFault(form, fault) {
       const isEmpty = input ? input.value.trim() === '' : pointer === fault.pointer;
       const name = inputs.length > 1 ? '' : nameField(input, fault.pointer);
       const text = (isEmpty && (input ?? place).dataset.missing) || writeFault(name, fault);
-      place.textContent = [place.textContent, text].filter(Boolean).join(' ');
+      const hint = input && /\d,\d/.test(input.value) && COMMA_HINT;
+      place.textContent = [place.textContent, text, hint].filter(Boolean).join(' ');
       return true;
     }
   }

@@ -1,6 +1,6 @@
-// Draws the figures that the server defines: first what is on the screen, and the others once the browser is idle.
+// Draws the figures that the server defines, once they are on the screen or on paper.
 
-import { Problem, ask, makeElement, post } from './live.js';
+import { Problem, ask, askAtOnce, makeElement, post } from './live.js';
 
 const dark = matchMedia('(prefers-color-scheme: dark)');
 const CONFIG = {
@@ -34,24 +34,30 @@ export async function draw(plot, extra = {}) {
   try {
     const figure = await ask(buildAddress(plot, extra));
     if (latest.get(plot) !== request) return;
-    if (!figure.data.length) {
-      if (!document.querySelector('[data-live="chip"][data-open="1"]')) plot.style.height = ''; // no figure will follow
-      return showMessage(plot, plot.dataset.empty ?? 'nothing to show yet');
-    }
-    plot.querySelector('.plot-empty')?.remove();
-    plot.style.height = `${figure.layout.height}px`;
-    const first = !plot.classList.contains('js-plotly-plot');
-    await window.Plotly.react(plot, figure.data, figure.layout, CONFIG);
-    plot.dataset.thinned = figure.layout.meta?.thinned ?? '';
-    plot.dispatchEvent(new CustomEvent('drawn', { bubbles: true, detail: figure.layout }));
-    if (first) {
-      plot.on('plotly_relayout', (change) => onZoom(plot, change));
-      offerImages(plot);
-    }
+    await show(plot, figure);
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
     if (latest.get(plot) === request && !plot.classList.contains('js-plotly-plot')) showMessage(plot, error.message);
   }
+}
+
+/** Show a figure in its plot. All but the promise is done at once. */
+function show(plot, figure) {
+  if (!figure.data.length) {
+    if (!document.querySelector('[data-live="chip"][data-open="1"]')) plot.style.height = ''; // no figure will follow
+    return showMessage(plot, plot.dataset.empty ?? 'nothing to show yet');
+  }
+  plot.querySelector('.plot-empty')?.remove();
+  plot.style.height = `${figure.layout.height}px`;
+  const first = !plot.classList.contains('js-plotly-plot');
+  const drawn = window.Plotly.react(plot, figure.data, figure.layout, CONFIG);
+  plot.dataset.thinned = figure.layout.meta?.thinned ?? '';
+  plot.dispatchEvent(new CustomEvent('drawn', { bubbles: true, detail: figure.layout }));
+  if (first) {
+    plot.on('plotly_relayout', (change) => onZoom(plot, change));
+    offerImages(plot);
+  }
+  return drawn;
 }
 
 /** Offer a drawn plot as SVG and as PNG, beside its CSV. */
@@ -68,25 +74,26 @@ function offerImages(plot) {
   }
 }
 
-/** Draw every plot in light colours for the width of a sheet, and print. */
-async function printAll() {
+/** Draw every plot in light colours for the width of a sheet. A browser that prints waits for no promise. */
+function drawForPaper() {
   document.body.classList.add('printing');
-  await Promise.all(listPlots().map((plot) => {
-    seen.add(plot);
-    return draw(plot);
-  }));
-  await fitPlots();
-  window.print();
+  let template;
+  for (const plot of listPlots()) {
+    const figure = askAtOnce(buildAddress(plot));
+    if (!figure) continue;
+    markSeen(plot);
+    show(plot, figure);
+    template = figure.layout.template;
+  }
+  for (const plot of listDrawn()) {
+    const shown = plot.layout.template;
+    window.Plotly.relayout(plot, { autosize: true, template: template ?? shown });
+    addEventListener('afterprint', () => window.Plotly.relayout(plot, { autosize: true, template: shown }), { once: true });
+  }
 }
 
-/** Fit what is drawn to the width of a sheet at once: the browser's own menu does not wait. */
-function fitToSheet() {
-  document.body.classList.add('printing');
-  for (const plot of document.querySelectorAll('.js-plotly-plot')) window.Plotly.relayout(plot, { autosize: true });
-  for (const plot of listPlots().filter((p) => !seen.has(p))) drawOnce(plot);
-}
-
-const fitPlots = () => Promise.all([...document.querySelectorAll('.js-plotly-plot')].map((plot) => window.Plotly.Plots.resize(plot)));
+/** List what is drawn, also plots without an address, which were computed on request. */
+const listDrawn = () => [...document.querySelectorAll('.js-plotly-plot')];
 
 /** Request the profiles of a run, and draw them. */
 export async function drawProfiles(button) {
@@ -144,36 +151,22 @@ export const redraw = (names) =>
 const watcher = new IntersectionObserver(
   (entries) => {
     for (const { target, isIntersecting } of entries) {
-      if (isIntersecting && !seen.has(target)) drawOnce(target);
+      if (!isIntersecting || seen.has(target)) continue;
+      markSeen(target);
+      draw(target);
     }
   },
   { rootMargin: '300px' },
 );
 
-function drawOnce(plot) {
+function markSeen(plot) {
   seen.add(plot);
   watcher.unobserve(plot);
-  return draw(plot);
 }
 
-const REST_MS = 2000;
-const whenIdle = window.requestIdleCallback ?? ((work) => setTimeout(work, 200)); // Safari has none
-let restTimer = 0;
-
-/** Draw the plots that were never on the screen, one after the other. A printed page needs them. */
-async function drawRest() {
-  const plot = listPlots().find((p) => !seen.has(p));
-  if (!plot) return;
-  await drawOnce(plot);
-  whenIdle(drawRest);
-}
-
-/** Draw every plot once it is on the screen, and the others later, including plots added since. */
+/** Draw every plot once it is on the screen, including plots added since. */
 export function watch() {
-  const waiting = listPlots().filter((plot) => !seen.has(plot));
-  waiting.forEach((plot) => watcher.observe(plot));
-  clearTimeout(restTimer);
-  if (waiting.length) restTimer = setTimeout(() => whenIdle(drawRest), REST_MS);
+  for (const plot of listPlots()) if (!seen.has(plot)) watcher.observe(plot);
 }
 
 // The figure lists its experiments.
@@ -189,15 +182,10 @@ document.addEventListener('change', ({ target }) => {
   if (name) setQuery(listPlots().find((p) => p.dataset.figure === name), 'experiment', target.value);
 });
 
-addEventListener('keydown', (event) => {
-  if (!(event.ctrlKey || event.metaKey) || event.key.toLowerCase() !== 'p') return;
-  event.preventDefault(); // the browser would not wait for the plots
-  printAll();
-});
-addEventListener('beforeprint', fitToSheet);
+addEventListener('beforeprint', drawForPaper);
 addEventListener('afterprint', () => {
   document.body.classList.remove('printing');
-  redraw().then(fitPlots);
+  redraw();
 });
 
 export function start() {

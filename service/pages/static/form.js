@@ -2,7 +2,7 @@
 
 import { Problem, address, ask, makeElement, keepLatest, post } from './live.js';
 import * as forms from './fields.js';
-import { clearFaults, fillTable, readOverrides, showProposals } from './fields.js';
+import { clearFaults, fillTable, parseNumber, readOverrides, showProposals } from './fields.js';
 import { forgetPreview, listValidationSteps, previewDataset, readSteps } from './preview.js';
 import { describeModel } from './equations.js';
 
@@ -43,7 +43,7 @@ async function fillFrom(job) {
   const { request, name } = await ask(address(`/v1/jobs/${encodeURIComponent(job)}`));
   const set = (key, value) => value !== undefined && value !== null && (field(key).value = value);
   state.extra = request;
-  set('name', name);
+  if (request.name) set('name', name); // the service names the other jobs after model and data
   const algorithm = request.algorithm ?? {};
   for (const key of ['method', 'population', 'generations']) set(key, algorithm[key]);
   if (Number.isInteger(algorithm.islands)) set('islands', algorithm.islands);
@@ -100,10 +100,12 @@ async function showDataset() {
 /** Store a file. Only the answer to the last choice of a recording is used. */
 const storeFile = keepLatest((question) => question());
 
+const showUpload = (text) => (document.getElementById('upload-state').textContent = text);
+
 /** Forget the upload that is not answered yet, and what the form says of an earlier one. */
 function dropUpload() {
   storeFile(async () => null);
-  showState('');
+  showUpload('');
   form.querySelector('[data-fault="/datasets"]').textContent = '';
 }
 
@@ -111,22 +113,22 @@ async function upload() {
   const [file] = field('upload').files;
   if (!file) return;
   clearFaults(form);
-  showState(`storing ${file.name}…`);
+  showUpload(`storing ${file.name}…`);
   try {
     const options = new URLSearchParams({ name: file.name });
-    const period = field('upload-period').value;
-    if (period) options.set('sample_time', period);
+    const period = readNumber('upload-period');
+    if (period !== null) options.set('sample_time', period);
     const stored = await storeFile(() => ask(address(`/v1/datasets?${options}`), {
       method: 'POST', headers: { 'Content-Type': 'application/octet-stream' }, body: file,
     }));
     if (!stored) return;
     await selectDataset(stored.id);
-    showState([`${file.name} is stored`, ...stored.warnings].join(' · '));
+    showUpload([`${file.name} is stored`, ...stored.warnings].join(' · '));
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
     const message = error.message.replace(/\bsample_time\b/g, 'the field "sampling period"');
     form.querySelector('[data-fault="/datasets"]').textContent = message;
-    showState('');
+    showUpload('');
   }
 }
 
@@ -167,6 +169,7 @@ async function checkModel(changes) {
 function showVerdict(result) {
   const place = document.getElementById('check');
   field('equations').ariaInvalid = String(!result.valid);
+  document.getElementById('about-model').classList.toggle('outdated', !result.valid);
   const list = document.createElement('ul');
   for (const fault of (result.valid ? result.warnings : result.errors) ?? []) {
     const where = [fault.pointer, fault.column && `column ${fault.column}`].filter(Boolean).join(', ');
@@ -187,8 +190,14 @@ function applyModel(model, equations, changes) {
   mapChannels();
 }
 
+/** Show in the empty field how the service will name the job. A batch is named after its label. */
+function showDefaultName() {
+  if (state.model && state.dataset && !state.extra.trend) field('name').placeholder = `${state.model.name} on ${state.dataset.name}`;
+}
+
 /** Draw one choice per signal of the model: the channel of the same name, else of the same place. */
 function mapChannels(wanted = {}, held = readHolds()) {
+  showDefaultName();
   if (!state.model || !state.dataset) return;
   const recorded = state.dataset.channels.map((channel) => channel.name);
   const inputs = Object.keys(state.model.inputs ?? {});
@@ -240,11 +249,7 @@ const readHolds = () =>
 const readChannels = () =>
   Object.fromEntries([...form.querySelectorAll('[data-signal]')].map((select) => [select.dataset.signal, select.value]));
 
-/** Read a number. Other text is sent as typed, so that the server reports the fault. */
-const readNumber = (name) => {
-  const text = field(name).value.trim();
-  return text === '' ? null : Number.isNaN(Number(text)) ? text : Number(text);
-};
+const readNumber = (name) => parseNumber(field(name).value);
 
 const isOwn = () => field('source').value === 'own';
 /** Return the own model. An unchanged cloned document is sent as it was, others in normal form. */

@@ -89,6 +89,18 @@ export async function ask(url, options = {}) {
   );
 }
 
+/** Ask and wait without a promise, for a browser that prints; null if there is no good answer. */
+export function askAtOnce(url) {
+  const request = new XMLHttpRequest();
+  request.open('GET', url, false);
+  try {
+    request.send();
+    return request.status === 200 ? JSON.parse(request.responseText) : null;
+  } catch {
+    return null; // the server cannot be reached
+  }
+}
+
 /** Wrap `question`: if calls overlap, only the last one gets its answer, and earlier ones get null. */
 export function keepLatest(question) {
   let latest = 0;

@@ -1,6 +1,7 @@
 // The channels of a recording in the form, and the part of it that is used.
 
 import { draw } from './figures.js';
+import { parseNumber } from './fields.js';
 import { address, makeElement } from './live.js';
 
 const plot = document.querySelector('[data-preview]');
@@ -81,8 +82,8 @@ export function listValidationSteps(part) {
 function readRange(form) {
   const range = {};
   for (const [name, key] of [['from', 'start'], ['to', 'stop']]) {
-    const text = field(form, name).value.trim();
-    if (text) range[key] = Number.isNaN(Number(text)) ? text : Number(text);
+    const value = parseNumber(field(form, name).value);
+    if (value !== null) range[key] = value;
   }
   return Object.keys(range).length ? range : null;
 }

@@ -1,7 +1,7 @@
 // Shared by the forms of recipes (noise sweep, re-identification): models, channels, numbers.
 
 import { address, ask, makeElement, keepLatest } from './live.js';
-import { fillTable } from './fields.js';
+import { fillTable, parseNumber } from './fields.js';
 
 const fetchModel = keepLatest((name) => ask(address(`/v1/models/${encodeURIComponent(name)}`)));
 
@@ -40,21 +40,19 @@ export function drawChannels(model, recorded) {
 export const readChannels = (form) =>
   Object.fromEntries([...form.querySelectorAll('[data-signal]')].map((select) => [select.dataset.signal, select.value]));
 
-/** Parse a number. Other text is sent as typed, so that the server reports the fault. */
-export function parseNumber(text) {
-  const trimmed = String(text).trim();
-  return trimmed === '' ? null : Number.isNaN(Number(trimmed)) ? trimmed : Number(trimmed);
-}
-
-/** Parse numbers between commas, or `start:stop:step` with both ends. */
+/**
+ * Parse numbers between commas, semicolons or spaces, or `start:stop:step` with both ends. Commas
+ * between digits separate only beside decimal points: 0,05 may be one number. Such a text is sent as typed.
+ */
 export function parseNumbers(text) {
-  const parts = text.split(':').map(Number);
+  const parts = text.split(':').map(parseNumber);
   if (parts.length === 3 && parts.every(Number.isFinite) && parts[2] > 0 && parts[1] >= parts[0]) {
     const [start, stop, step] = parts;
     const count = Math.min(Math.floor((stop - start) / step + 1e-9) + 1, 100_001);
     return Array.from({ length: count }, (_, k) => Number((start + k * step).toPrecision(12)));
   }
-  return text.split(/[,;\s]+/).filter(Boolean).map(parseNumber);
+  if (!text.includes(';') && !text.includes('.') && /\d,\d/.test(text)) return [text.trim()];
+  return text.split(text.includes(';') ? /[;\s]+/ : /[,\s]+/).filter(Boolean).map(parseNumber);
 }
 
 /** Read the settings of the search that were typed. */

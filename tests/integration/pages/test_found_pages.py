@@ -181,7 +181,7 @@ def test_the_lineage_of_a_job_is_drawn_with_links(client: TestClient, filled: Fi
     page = client.get(f"/jobs/{filled.finished}").text
     drawn = page[page.index('<svg class="lineage"') :].partition("</svg>")[0]
     assert f'<a href="/datasets/{filled.dataset}" aria-label="recording tube 40 m">' in drawn
-    assert f'<a href="/runs/{filled.finished_run}" aria-label="run run 1 of tube' in drawn
+    assert f'<a href="/runs/{filled.finished_run}" aria-label="run 1 of tube' in drawn
     assert drawn.count('<g class="shown">') == 1
     assert 'aria-label="reference tube"' in drawn
     assert f'href="/jobs/{filled.sweep}"' not in drawn  # it only used the same recording

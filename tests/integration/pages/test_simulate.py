@@ -14,6 +14,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.api.app import create_app
+from service.control.closed_loop import suggest_controller
 from service.core.concurrency import MAX_RUNNING, MAX_WAITING, simulation_limit
 from service.jobs.stored_run import StoredRun
 from service.pages.simulate import _default_values, _FormContext
@@ -180,6 +181,29 @@ def test_the_form_suggests_a_step_within_what_was_measured(place: Place) -> None
     assert 'name="time" value="0"' in asked
 
 
+def test_the_form_suggests_the_controller_of_a_rule_if_the_model_allows_one(place: Place) -> None:
+    form = place.client.get(place.page).text
+    assert '<option value="simc PI" selected>' in form
+    gain, integral_time = (
+        float(re.search(rf'name="{name}" value="([^"]*)"', form)[1])  # type: ignore[index]
+        for name in ("gain", "integral_time")
+    )
+    assert (gain, integral_time) == pytest.approx((0.5, 1.0), rel=1e-3)
+    assert suggest_controller(load_model("tube"), {**TRUE, "L": 0.0}, "u", "y") is None
+    assert suggest_controller(load_model("narx"), {}, "u", "y") is None
+
+
+def test_the_figure_begins_near_the_step_and_the_table_at_the_start(place: Place) -> None:
+    query = "gain=0.5&time=20&duration=40&sample_time=0.1"
+    text = place.client.get(f"{place.page}?{query}").text
+    figure = re.search(r'id="figure-simulation">(.*?)</script>', text, re.DOTALL)
+    assert figure is not None
+    starts = [trace["x"][0] for trace in json.loads(figure.group(1))["data"]]
+    assert starts == pytest.approx(len(starts) * [18])
+    table = place.client.get(f"{place.page}?{query}&format=csv").text
+    assert next(line for line in table.splitlines() if line.startswith("y,")).startswith("y,0.0,")
+
+
 def test_the_suggested_step_comes_once_the_loop_rests(place: Place) -> None:
     form = place.client.get(place.page).text
     names = "offset|amplitude|time|duration|sample_time"
@@ -285,6 +309,13 @@ def test_a_pi_controller_with_limits_is_simulated_as_by_rest(place: Place) -> No
     assert re.search(r'"y0":0\.65,"y1":0\.65', text)  # the limit in the figure
 
 
+def test_a_decimal_comma_is_read(place: Place) -> None:
+    query = "gain=0,6&integral_time=1,25e0&lower=-,5&upper=1000,5"
+    control = curl_of(place.client.get(f"{place.page}?{LOOP}&{query}").text)["control"]
+    names = "gain", "integral_time", "lower", "upper"
+    assert [control[name] for name in names] == [0.6, 1.25, -0.5, 1000.5]
+
+
 def test_a_rule_fills_in_the_numbers_that_it_chose(place: Place) -> None:
     text = place.client.get(f"{place.page}?{LOOP}&gain=7&tuning=simc+PI").text
     body = curl_of(text)
@@ -306,6 +337,7 @@ def test_a_limit_cycle_is_no_settling_time(place: Place) -> None:
     assert "keeps oscillating" in text
     assert "oscillates and does not settle" in text
     assert "<dd>unstable</dd>" in text
+    assert "a longer integral time, or another sign" in text
     assert "Gain margin" not in text
 
 
@@ -322,6 +354,10 @@ def test_a_limit_cycle_is_no_settling_time(place: Place) -> None:
             "closed-loop time constant: rule &#39;amigo&#39; has no such setting",
         ),
         ("gain=abc&duration=5&sample_time=0.1", "gain: found &#39;abc&#39;; need a number"),
+        (
+            "gain=1,000&duration=5&sample_time=0.1",
+            "gain: found &#39;1,000&#39;; need a number with a decimal point",
+        ),
         ("gain=nan&duration=5&sample_time=0.1", "gain: found &#39;nan&#39;; need a number"),
         ("gain=1&duration=5", "sampling period: it is missing"),
         ("gain=1&duration=1e9&sample_time=0.1", "duration: 1e+09 s with a period of 0.1 s are"),

@@ -144,6 +144,32 @@ def test_a_queued_job_is_cancelled_at_once_resumed_and_cloned(
     assert server.get(f"/v1/jobs/{twin['id']}").json()["request"]["seed"] == 5
 
 
+LENGTHS = [{"length_m": 1.0}, {"length_m": 2.0}]
+TREND = {
+    "trend": {"x": "length_m"},
+    "sweep": {"axes": [{"path": "/seed", "values": [1, 2], "labels": LENGTHS}]},
+}
+
+
+@pytest.mark.parametrize(
+    ("fields", "name"),
+    [
+        ({}, "fopdt on steps"),
+        ({"name": None, **TREND}, "fopdt over length [m]"),
+        ({"name": "spring", **TREND}, "spring"),
+    ],
+)
+def test_a_job_without_a_name_is_named_by_the_service_and_its_clone_again(
+    server: TestClient, dataset: str, fields: dict[str, Any], name: str
+) -> None:
+    job = submit(server, dataset, **fields)
+    assert job["name"] == name
+    twin = server.post(f"/v1/jobs/{job['id']}:clone").json()
+    assert twin["name"] == name
+    requests = [server.get(f"/v1/jobs/{one['id']}").json()["request"] for one in (job, twin)]
+    assert [one["name"] for one in requests] == 2 * [fields.get("name")]
+
+
 def test_events_resume_after_the_last_one_known_and_end_with_the_job(
     own: TestClient,
 ) -> None:

@@ -1,4 +1,4 @@
-"""docs/job.md: every field of a job and every step is there, and its examples hold."""
+"""docs/job.md and docs/derive.md: every field and every step is there, and their examples hold."""
 
 import json
 import re
@@ -17,8 +17,12 @@ from sysid.data.noise import NOISE_KINDS
 from sysid.data.records import HOLDS, Channel, Recording, Segment
 from tests.repository import ROOT
 
-PAGE = (ROOT / "docs/job.md").read_text(encoding="utf-8")
-EXAMPLES = [yaml.safe_load(text) for text in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)]
+PAGES = [(ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("job.md", "derive.md")]
+EXAMPLES = [
+    yaml.safe_load(text)
+    for page in PAGES
+    for text in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+]
 JOBS = [one for one in EXAMPLES if "model" in one]
 STEP_LISTS = [one for one in EXAMPLES if "steps" in one]
 
@@ -32,7 +36,7 @@ def rows(page: str) -> dict[str, list[str]]:
     }
 
 
-ROWS, STEP_ROWS = (rows(part) for part in PAGE.split("# Steps of a derived dataset"))
+ROWS, STEP_ROWS = map(rows, PAGES)
 
 
 def within(field: Any) -> Iterator[str]:

@@ -1,6 +1,9 @@
-"""What pages call the fields that distinguish a run."""
+"""What pages call the fields that distinguish a run, and what their notes advise."""
 
-from service.pages.views import format_cell
+from service.core.states import JobState
+from service.pages.views import format_cell, to_run_view
+from service.storage.tables import Run
+from tests.repository import ROOT
 
 
 def test_fields_are_told_by_their_last_part_and_those_that_end_alike_in_full() -> None:
@@ -11,3 +14,25 @@ def test_fields_are_told_by_their_last_part_and_those_that_end_alike_in_full() -
 
 def test_where_labels_tell_of_the_data_their_identifiers_are_left_out() -> None:
     assert format_cell({"/datasets": ["ds_1"], "/seed": 2}, {"length_m": 5}) == "length_m 5, seed 2"
+
+
+def test_a_note_names_the_fields_of_the_form() -> None:
+    note = "Read as straight lines (hold: {u: first}) or with loss: {noise_model: ar1} it differs"
+    run = Run(
+        id="run_1",
+        number=0,
+        state=JobState.FAILED,
+        cell={},
+        labels={},
+        evaluations=0,
+        generations=0,
+        result={"warnings": [note], "verdict": {"trust": "limited", "text": "", "reasons": []}},
+    )
+    [shown] = to_run_view(run, "", {}).warnings
+    assert shown == (
+        "Read as straight lines (“u between samples: straight line (first)”) or with "
+        "“noise: first-order coloured (ar1)” it differs"
+    )
+    pages = ROOT / "service/pages"
+    assert "} between samples`" in (pages / "static/form.js").read_text()
+    assert "<label>noise <select" in (pages / "templates/form.html").read_text()

@@ -26,20 +26,6 @@ def test_runs_come_in_the_order_of_the_label_each_with_its_own_data() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "name"),
-    [
-        ({}, "tube over length [m]"),
-        ({"name": None}, "tube over length [m]"),  # an empty field of the form
-        ({"name": "spring"}, "spring"),
-    ],
-)
-def test_a_batch_without_a_name_is_called_after_model_and_label(
-    fields: dict[str, Any], name: str
-) -> None:
-    assert job_of(**fields).name == name
-
-
-@pytest.mark.parametrize(
     ("fields", "warm", "reference"),
     [
         ({}, "previous", None),

@@ -1,5 +1,6 @@
 """The verdict of a result: what speaks against it, the most severe first."""
 
+import math
 from typing import Any
 
 import pytest
@@ -41,6 +42,7 @@ def test_a_result_that_nothing_speaks_against_is_trustworthy() -> None:
         ({"valid": False}, "the model is invalid"),
         ({"search": SearchEvidence(False, None, 6, 1)}, "not settled"),
         ({"fit_percent": -3.0}, "the model does not explain the output"),
+        ({"fit_percent": math.nan}, "the output is constant"),
         (
             {"estimates": [estimate("L", "not validated")]},
             "the validation data contradict the model",

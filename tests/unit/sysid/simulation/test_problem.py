@@ -209,7 +209,9 @@ def test_no_record_and_a_constant_output_among_several_are_refused() -> None:
         Problem.build(duffing(), [])
     model = differential({"x": "(u(t) - x)*b"}, "x", outputs={"y": "x", "z": "2*x"})
     data = record(outputs=("y", "z"))
-    flat = replace(data, outputs=(data.outputs[0], replace(data.outputs[1], values=np.ones(30))))
+    flat = replace(
+        data, outputs=(data.outputs[0], replace(data.outputs[1], values=np.full(30, 0.1)))
+    )
     with pytest.raises(InvalidRecord, match="'z' is constant"):
         Problem.build(model, [flat])
 
