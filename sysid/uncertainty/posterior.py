@@ -129,7 +129,7 @@ def _find_obstacle(problem: Problem, theta: FloatArray, analysis: Analysis) -> s
     """Find what prevents a likelihood; empty if nothing does."""
     if analysis.likelihood is None:
         return next(
-            (estimate.reason for estimate in analysis.estimates if estimate.reason),
+            (one.reason for one in analysis.estimates if one.reason and one.stderr is None),
             "there are no standard errors",
         )
     rms = float(problem.evaluate_fitness(theta[None])[0])
