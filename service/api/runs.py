@@ -7,6 +7,7 @@ from fastapi import APIRouter, Query, Request, Response
 from service.api.bodies import JsonRoute
 from service.api.content import (
     FILE_ANSWERS,
+    CsvResponse,
     McapResponse,
     MemoryContent,
     content_response,
@@ -140,6 +141,13 @@ def export_model(
     model = exports.export_run(session, run_id, format, pade_order)
     headers = {"Content-Disposition": f'attachment; filename="{model.name}"'}
     return Response(model.text, media_type=model.media_type, headers=headers)
+
+
+@router.get("/{run_id}/estimates.csv", response_class=CsvResponse)
+def export_estimates_csv(run_id: str, session: ReadSession) -> CsvResponse:
+    """Export the estimates as CSV: a row per parameter, with error, interval, unit and status."""
+    disposition = {"Content-Disposition": f'attachment; filename="{run_id}.csv"'}
+    return CsvResponse([exports.write_estimates(session, run_id)], headers=disposition)
 
 
 @router.post("/{run_id}:simulate")

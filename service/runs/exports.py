@@ -8,12 +8,14 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest
+from service.core.text import write_csv
 from service.jobs.stored_run import StoredRun, load_estimated_run
 from service.repositories.datasets import DatasetRepository
 from service.storage.errors import StorageError
 from service.storage.tables import Dataset
 from sysid.control.linear_form import Covariance, IdentifiedModel, IdentifiedValue, NotLinear
 from sysid.core.errors import InvalidSettings
+from sysid.core.text import find_shown_error
 from sysid.data.records import Hold
 from sysid.export.export import ExportFormat, write_export
 
@@ -28,6 +30,11 @@ _MEDIA_TYPES: Mapping[ExportFormat, tuple[str, str]] = {
 
 TEXT_TYPES = sorted({kind for kind, _ in _MEDIA_TYPES.values()} - {"application/json"})
 """Media types of the formats that are source code."""
+
+ESTIMATE_COLUMNS = (
+    *("parameter", "value", "stderr", "interval95_low", "interval95_high"),
+    *("unit", "status", "lower_bound", "upper_bound"),
+)
 
 
 class ExportFile(NamedTuple):
@@ -65,6 +72,29 @@ def export_run(session: Session, run_id: str, format: ExportFormat, pade_order: 
     media_type, ending = _MEDIA_TYPES[format]
     stem = re.sub(r"[^A-Za-z0-9]+", "_", stored.model.name)
     return ExportFile(text, media_type, stem + ending)
+
+
+def write_estimates(session: Session, run_id: str) -> str:
+    """Write the estimates of a run as CSV, one per row, in the order of the model.
+
+    The error and the interval are empty where `find_shown_error` finds none.
+
+    Raises
+    ------
+    NotFound
+        If there is no such run.
+    Conflict
+        If the run has no estimates.
+    """
+    stored = load_estimated_run(session, run_id, "export")
+    return write_csv([ESTIMATE_COLUMNS, *map(_list_fields, stored.estimates)])
+
+
+def _list_fields(estimate: Mapping[str, Any]) -> tuple[object, ...]:
+    stderr = find_shown_error(estimate["stderr"], estimate["status"])
+    low, high = (None if stderr is None else estimate["interval95"]) or (None, None)
+    names = "unit", "status", "lower", "upper"
+    return estimate["name"], estimate["value"], stderr, low, high, *map(estimate.get, names)
 
 
 def _build_identified(session: Session, stored: StoredRun) -> IdentifiedModel:

@@ -1,5 +1,7 @@
 """The identified model of a run as JSON, Python, C and python-control: REST, clients, commands."""
 
+import csv
+import io
 import json
 import re
 from collections.abc import Iterator
@@ -198,3 +200,21 @@ def test_the_page_of_a_finished_run_links_to_every_format(served: Served) -> Non
     page = served.server.get(f"/jobs/{job}").text
     for format in FORMATS:
         assert f"/v1/runs/{served.run}/export?format={format}" in page
+
+
+def test_estimates_are_a_table_that_spreadsheets_read(served: Served) -> None:
+    answer = served.server.get(f"/v1/runs/{served.run}/estimates.csv")
+    assert answer.headers["content-type"] == "text/csv; charset=utf-8"
+    rows = {row["parameter"]: row for row in csv.DictReader(io.StringIO(answer.text))}
+    for one in served.server.get(f"/v1/runs/{served.run}").json()["parameters"]:
+        row = rows.pop(one["name"])
+        assert (float(row["value"]), row["unit"]) == (one["value"], one["unit"])
+        assert (row["status"], float(row["upper_bound"])) == (one["status"], one["upper"])
+        shown = one["stderr"] is not None and one["status"] != "at bound"
+        assert row["stderr"] == (str(one["stderr"]) if shown else "")
+        ends = one["interval95"] if shown else ["", ""]
+        assert [row["interval95_low"], row["interval95_high"]] == list(map(str, ends))
+    assert not rows
+    assert f"{served.run}/estimates.csv" in served.server.get(f"/runs/{served.run}").text
+    waiting = served.server.get(f"/v1/runs/{served.waiting}/estimates.csv")
+    assert waiting.status_code == 409
