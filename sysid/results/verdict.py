@@ -24,6 +24,7 @@ _UNLIKELY = 1e-3  # probability of such residuals under a true model
 _SEPARABLE_STDERRS = 2.0  # a smaller time lag is not distinguishable from 0
 _EXPLAINED = 99.999  # %: what is left are errors of the solver
 _DEPENDENT = "order-dependent", "prediction-dependent", "hold-dependent"
+_LITTLE = 30.0  # %: a smaller fit is serious if the residuals are not noise
 _NOTABLE_LOSS = 20.0  # percentage points of fit, from estimation to validation
 
 
@@ -228,12 +229,23 @@ def _find_other_hold(evidence: Evidence) -> Iterator[Reason]:
 
 
 def _find_no_fit(evidence: Evidence) -> Iterator[Reason]:
-    if _is_number(evidence.fit_percent) and evidence.fit_percent <= 0:
+    """Find a model that explains nothing, or little of what is not noise."""
+    fit = evidence.fit_percent
+    if not _is_number(fit):
+        return
+    if fit <= 0:
         yield Reason(
             "serious",
             "the model does not explain the output",
-            f"The fit is {evidence.fit_percent:.1f} %: a constant fits as well. Choose another "
-            "model, or look at channels and bounds.",
+            f"The fit is {fit:.1f} %: a constant fits as well. Choose another model, or look at "
+            "channels and bounds.",
+        )
+    elif fit < _LITTLE and evidence.has_failed("whiteness"):
+        yield Reason(
+            "serious",
+            "the model explains little of the output",
+            f"The fit is {fit:.1f} %, and what is left is not noise. Choose another model, or look "
+            "at channels and bounds.",
         )
 
 

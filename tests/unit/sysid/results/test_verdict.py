@@ -32,6 +32,10 @@ def judged(**evidence: Any) -> tuple[str, str]:
     return verdict.trust, verdict.text
 
 
+def test_a_small_fit_beside_much_white_noise_is_trustworthy() -> None:
+    assert judged(fit_percent=15.0) == ("trustworthy", "trustworthy")
+
+
 def test_a_result_that_nothing_speaks_against_is_trustworthy() -> None:
     assert judged() == ("trustworthy", "trustworthy")
 
@@ -43,6 +47,10 @@ def test_a_result_that_nothing_speaks_against_is_trustworthy() -> None:
         ({"search": SearchEvidence(False, None, 6, 1)}, "not settled"),
         ({"fit_percent": -3.0}, "the model does not explain the output"),
         ({"fit_percent": math.nan}, "the output is constant"),
+        (
+            {"fit_percent": 15.0, "tests": [residual_test()]},
+            "the model explains little of the output",
+        ),
         (
             {"estimates": [estimate("L", "not validated")]},
             "the validation data contradict the model",
