@@ -398,6 +398,10 @@ class AsyncClient:
         """Download the table of all runs of a job as CSV, piece by piece."""
         return self._download(calls.RUNS_CSV(job))
 
+    def download_estimates(self, run: str) -> AsyncIterator[bytes]:
+        """Download the estimates of a run as CSV, one parameter per row."""
+        return self._download(calls.ESTIMATES_CSV(run))
+
     async def run(self, name: str) -> "documents.RunDocument":
         """Fetch the result of one run."""
         return await self._fetch(calls.RUN(name))

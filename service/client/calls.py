@@ -248,6 +248,7 @@ EXPORT: Endpoint[bytes] = Endpoint("GET", "runs/{}/export")
 COMPARE: "Endpoint[documents.ComparisonDocument]" = Endpoint("POST", "runs:compare")
 
 RUNS_CSV: Endpoint[bytes] = Endpoint("GET", "jobs/{}/runs.csv")
+ESTIMATES_CSV: Endpoint[bytes] = Endpoint("GET", "runs/{}/estimates.csv")
 SUMMARY_FIGURE: "Endpoint[documents.FigureDocument]" = Endpoint("GET", "jobs/{}/figures/summary")
 TREND_FIGURE: "Endpoint[documents.FigureDocument]" = Endpoint("GET", "jobs/{}/figures/trend")
 RUN_SIGNALS: Endpoint[bytes] = Endpoint("GET", "runs/{}/signals.mcap")

@@ -229,18 +229,20 @@ def _find_other_hold(evidence: Evidence) -> Iterator[Reason]:
 
 
 def _find_no_fit(evidence: Evidence) -> Iterator[Reason]:
-    """Find a model that explains nothing, or little of what is not noise."""
     fit = evidence.fit_percent
-    if not _is_number(fit):
-        return
-    if fit <= 0:
+    if _is_number(fit) and fit <= 0:
         yield Reason(
             "serious",
             "the model does not explain the output",
             f"The fit is {fit:.1f} %: a constant fits as well. Choose another model, or look at "
             "channels and bounds.",
         )
-    elif fit < _LITTLE and evidence.has_failed("whiteness"):
+
+
+def _find_little_fit(evidence: Evidence) -> Iterator[Reason]:
+    """Find a model that explains little of what is not noise, perhaps because of a bound."""
+    fit = evidence.fit_percent
+    if _is_number(fit) and 0 < fit < _LITTLE and evidence.has_failed("whiteness"):
         yield Reason(
             "serious",
             "the model explains little of the output",
@@ -382,6 +384,7 @@ _FINDERS: tuple[Callable[[Evidence], Iterator[Reason]], ...] = (
     _find_misled_run,
     _find_refuted,
     _find_bounds,
+    _find_little_fit,
     _find_undetermined,
     _find_other_order,
     _find_other_hold,
