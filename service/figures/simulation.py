@@ -61,6 +61,8 @@ def begin_near_step(figure: Figure, step_time: float) -> None:
     """Leave out what was long before the step of the reference, such as the start of the loop."""
     for trace in figure["data"]:
         times = np.asarray(trace["x"], dtype=np.float64)
+        if not times.size or step_time >= times[-1]:
+            continue
         first = int(np.searchsorted(times, step_time - _LEAD * (times[-1] - step_time)))
         trace["x"], trace["y"] = trace["x"][first:], trace["y"][first:]
 

@@ -121,14 +121,15 @@ def _list_orders(comparison: Document | None) -> list[OrderView]:
     """List the orders of a process; none if they were not compared."""
     if not comparison:
         return []
-    unit, lowest = plain_unit(comparison["unit"]), min(fit["bic"] for fit in comparison["fits"])
+    unit = plain_unit(comparison["unit"])
+    lowest = min((fit["bic"] for fit in comparison["fits"] if fit["bic"] is not None), default=0.0)
     return [
         OrderView(
             fit["model"],
             fit["order"],
             comparison["delay"],
             join_estimate(fit["delay"], fit["delay_stderr"]) + unit,
-            format_criterion(fit["bic"] - lowest),
+            format_criterion(None if fit["bic"] is None else fit["bic"] - lowest),
             "preferred"
             if fit["model"] == comparison["preferred_model"]
             else "possible"

@@ -152,7 +152,8 @@ def write_results_csv(session: Session, choice: ResultChoice) -> str:
 
 def _list_fields(row: ResultRow, one: Mapping[str, Any]) -> tuple[object, ...]:
     """List the fields of a line of the file, in the order of `COLUMNS`."""
-    low, high = one["interval95"] or (None, None)
+    stderr = find_shown_error(one["stderr"], one["status"])
+    low, high = (None if stderr is None else one["interval95"]) or (None, None)
     return (
         row.job.id,
         row.run,
@@ -162,7 +163,7 @@ def _list_fields(row: ResultRow, one: Mapping[str, Any]) -> tuple[object, ...]:
         _describe_place(row),
         one["name"],
         one["value"],
-        find_shown_error(one["stderr"], one["status"]),
+        stderr,
         low,
         high,
         one["unit"],

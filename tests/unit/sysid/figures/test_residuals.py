@@ -131,3 +131,11 @@ def test_onset_delays_tell_steps_and_spread_or_the_reason() -> None:
 @pytest.mark.parametrize(("p", "text"), [(None, "–"), (0.0, "< 0.001"), (0.0414, "0.041")])
 def test_chances(p: float | None, text: str) -> None:
     assert format_p_value(p) == text
+
+
+def test_orders_are_shown_by_the_difference_of_bic_also_where_one_has_none() -> None:
+    order = {"order": 1, "delay": 1.0, "delay_stderr": None, "is_open": False}
+    fits = [{**order, "model": f"m{n}", "bic": bic} for n, bic in enumerate([-30.0, -24.5, None])]
+    comparison = {"unit": "s", "delay": "L", "preferred_model": "m0", "fits": fits}
+    shown = to_diagnostics({"order_comparison": comparison}).orders
+    assert [one.bic_text for one in shown] == ["0.0", "5.5", "–"]
