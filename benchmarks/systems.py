@@ -66,25 +66,29 @@ class System:
     def clean(self) -> FloatArray:
         """The output without noise."""
         first = np.full(self.samples, self.start.get("y", 0.0))
-        problem = self._build_problem(first)
+        problem = self._build_problem(self._build_record(first))
         return problem.predict(self.place(problem)[None])[0]
 
     def place(self, problem: Problem) -> FloatArray:
         """The true values in the order of the free parameters."""
         return np.array([self.truth[name] for name in problem.free_names])
 
-    def problem(self, seed: int) -> Problem:
-        """The system's record with the noise of that seed, ready to be fitted."""
+    def record(self, seed: int) -> Record:
+        """The system's record with the noise of that seed."""
         scale = 1.0 if self.absolute else float(np.std(self.clean))
         draw = np.random.default_rng(seed).standard_normal(self.samples)
-        return self._build_problem(self.clean + self.noise * scale * draw)
+        return self._build_record(self.clean + self.noise * scale * draw)
+
+    def problem(self, seed: int) -> Problem:
+        """The system's record with the noise of that seed, ready to be fitted."""
+        return self._build_problem(self.record(seed))
 
     @property
     def level(self) -> float:
         """RMS of the output without noise."""
         return rms(self.clean)
 
-    def _build_problem(self, y: FloatArray) -> Problem:
+    def _build_record(self, y: FloatArray) -> Record:
         times = self.step * np.arange(self.samples)
         inputs = []
         if self.drive is not None:
@@ -92,10 +96,10 @@ class System:
             inputs.append(
                 Channel(signal.name, times, self.drive(times), signal.unit, hold=self.hold)
             )  # type: ignore[arg-type]
-        output = Channel(self.parsed.outputs[0].name, times, y)
-        return Problem.build(
-            self.parsed, [Record(tuple(inputs), (output,))], parameters=self.parameters
-        )
+        return Record(tuple(inputs), (Channel(self.parsed.outputs[0].name, times, y),))
+
+    def _build_problem(self, record: Record) -> Problem:
+        return Problem.build(self.parsed, [record], parameters=self.parameters)
 
 
 def _cosine(times: FloatArray) -> FloatArray:
