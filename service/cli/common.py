@@ -4,12 +4,14 @@ A server reports faults at pointers into the body. Here they are reported where 
 at an option or in a file.
 """
 
+import inspect
 import json
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import wraps
 from math import isfinite
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, Any, NoReturn
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
     from service.client.client import Client
 
 
+Document = Mapping[str, Any]
+"""An answer of the server."""
 MODEL_SUFFIXES = (".yaml", ".yml", ".json")
 PIPE_WIDTH = 200  # in a pipe or a file, lines are not folded at 80 columns
 STANDARD_INPUT = Path("-")
@@ -138,23 +142,6 @@ Force = Annotated[
     typer.Option("--force", "-f", help="Overwrite what is there.", rich_help_panel=OUTPUT_PANEL),
 ]
 
-__all__ = [
-    "DEFAULT_URL",
-    "AsJson",
-    "Force",
-    "Key",
-    "Limit",
-    "Quiet",
-    "SampleTime",
-    "Segments",
-    "Url",
-    "connect_client",
-    "fail",
-    "out",
-    "print_json",
-]
-
-
 def show_examples(*commands: str) -> str:
     """Return the end of a command's help: examples that can be copied."""
     lines = (f"[dim]$[/] {command.replace('[', chr(92) + '[')}" for command in commands)
@@ -168,6 +155,55 @@ def connect_client(url: str, key: str | None = None) -> "Iterator[Client]":
 
     with Client(url, key) as client:
         yield client
+
+
+_SHARED_OPTIONS = {
+    "url": (Url, DEFAULT_URL),
+    "key": (Key, None),
+    "as_json": (AsJson, False),
+    "quiet": (Quiet, False),
+}
+
+
+def server_command(
+    show: Callable[[Any], None] | None = None,
+) -> Callable[[Callable[..., Any]], Callable[..., None]]:
+    """Make a command of a function that asks a server: ``--url``, ``--key``, ``--json``, ``-q``.
+
+    The function takes a client and its own options, and returns what the server answered. That is
+    printed as JSON, or by `show` for people. A function that prints by itself returns None, and
+    takes `as_json` where it needs that. One without either has no ``--json``.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., None]:
+        signature = inspect.signature(function)
+        takes_json = "as_json" in signature.parameters
+        own = [p for p in signature.parameters.values() if p.name not in ("client", "as_json")]
+        shared = [
+            inspect.Parameter(
+                name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind
+            )
+            for name, (kind, default) in _SHARED_OPTIONS.items()
+            if name != "as_json" or takes_json or show is not None
+        ]
+
+        @wraps(function)
+        def run_command(url: str, key: str | None, quiet: bool, **options: Any) -> None:
+            as_json = options.get("as_json", False)
+            if not takes_json:
+                options.pop("as_json", None)
+            with connect_client(url, key) as client:
+                answer = function(client, **options)
+                if answer is not None:
+                    (print_json if as_json or show is None else show)(answer)
+
+        parameters = [*own, *shared]
+        # Typer reads the options of a command from these two.
+        run_command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+        run_command.__annotations__ = {p.name: p.annotation for p in parameters}
+        return run_command
+
+    return decorate
 
 
 def fail(message: str, code: int = 1) -> NoReturn:

@@ -12,17 +12,12 @@ from service.cli.common import (
     DOCUMENT_HELP,
     LISTED_ENTRIES,
     STANDARD_INPUT,
-    AsJson,
     FieldOrigins,
     Force,
-    Key,
     Limit,
-    Quiet,
     SampleTime,
     Segments,
-    Url,
     check_file,
-    connect_client,
     fail,
     fail_usage,
     fetch_listing,
@@ -41,6 +36,7 @@ from service.cli.common import (
     read_object,
     replace_file,
     report_faults,
+    server_command,
     show_examples,
     upload_origins,
 )
@@ -53,7 +49,6 @@ from service.cli.items import (
     add_item_commands,
     read_filters,
 )
-from service.client.calls import DEFAULT_URL
 from service.core.text import format_subtracted
 from sysid.core.errors import suggest_name
 from sysid.core.text import append_unit
@@ -70,21 +65,36 @@ DATASET_ID = "ds_"
 DatasetName = Annotated[str, typer.Argument(metavar="DATASET", help="Id or name of a dataset.")]
 
 
+def _print_dataset(stored: Mapping[str, Any]) -> None:
+    period = stored["sample_time"]
+    sampling = "irregular sampling" if period is None else f"sampling period {period:.6g} s"
+    before = stored["details"].get("known_before")
+    history = f"known for {before:.6g} s before, " if before else ""
+    started = f"started at {stored['started_at']}, " if stored["started_at"] else ""
+    print_line(
+        f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, "
+        f"{started}{history}channels {_format_channels(stored)}"
+    )
+    for trend in stored["details"].get("subtracted") or ():
+        print_note(f"subtracted from {format_subtracted(trend)}")
+    for warning in stored["warnings"]:
+        print_note(warning)
+
+
+@server_command()
 def list_datasets(
+    client: "Client",
     name: NamePart = None,
     tag: TagFilter = None,
     label: LabelFilter = None,
     since: Since = None,
     until: Until = None,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
     limit: Limit = None,
-    as_json: AsJson = False,
+    as_json: bool = False,
 ) -> None:
     """List the recordings of the server, latest first."""
     filters = read_filters(name=name, tag=tag, label=label, since=since, until=until)
-    with connect_client(url, key) as client:
-        listing = fetch_listing(lambda most: client.datasets(most, **filters), limit, as_json)
+    listing = fetch_listing(lambda most: client.datasets(most, **filters), limit, as_json)
     print_listing(
         listing,
         as_json,
@@ -111,17 +121,16 @@ def list_datasets(
         "zcat recording.csv.gz | lagid dataset add - --name recording",
     ),
 )
+@server_command()
 def add_datasets(
+    client: "Client",
     files: Annotated[list[Path], typer.Argument(metavar="FILE…", help=DATA_HELP)],
     name: Annotated[
         str | None, typer.Option(help="Name of a single one; by default that of the file.")
     ] = None,
     segments: Segments = None,
     sample_time: SampleTime = None,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    as_json: bool = False,
 ) -> None:
     """Store recordings."""
     if name is not None and len(files) > 1:
@@ -129,37 +138,32 @@ def add_datasets(
     for file in files:
         check_file(file)
     stored = []
-    with connect_client(url, key) as client:
-        for file in files:
-            source = read_file(file) if file == STANDARD_INPUT else file
-            with report_faults(upload_origins(file)):
-                stored.append(
-                    client.add_dataset(source, name, segments=segments, sample_time=sample_time)
-                )
-            if not as_json:
-                _print_dataset(stored[-1], as_json)
+    for file in files:
+        source = read_file(file) if file == STANDARD_INPUT else file
+        with report_faults(upload_origins(file)):
+            stored.append(
+                client.add_dataset(source, name, segments=segments, sample_time=sample_time)
+            )
+        if not as_json:
+            _print_dataset(stored[-1])
     if as_json:
         print_json(stored[0] if len(files) == 1 else stored)
 
 
+def _print_whole_dataset(stored: Mapping[str, Any]) -> None:
+    _print_dataset(stored)
+    rows = [
+        [channel[field] for field in ("name", "unit", "samples", "missing", "hold")]
+        for channel in stored["channels"]
+    ]
+    print_table(("channel", "unit", ">samples", ">missing", "hold"), rows, empty="none")
+
+
 @app.command("show", epilog=show_examples("lagid dataset show recording"))
-def show_dataset(
-    dataset: DatasetName,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
+@server_command(_print_whole_dataset)
+def show_dataset(client: "Client", dataset: DatasetName) -> Mapping[str, Any]:
     """Show one recording: its samples and its channels."""
-    with connect_client(url, key) as client:
-        found = find_dataset(client, dataset)
-    _print_dataset(found, as_json)
-    if not as_json:
-        rows = [
-            [channel[field] for field in ("name", "unit", "samples", "missing", "hold")]
-            for channel in found["channels"]
-        ]
-        print_table(("channel", "unit", ">samples", ">missing", "hold"), rows, empty="none")
+    return find_dataset(client, dataset)
 
 
 @app.command(
@@ -169,7 +173,9 @@ def show_dataset(
         "lagid dataset download recording --format csv --output - | head",
     ),
 )
+@server_command()
 def download_dataset(
+    client: "Client",
     dataset: DatasetName,
     file: Annotated[
         Path | None,
@@ -181,19 +187,16 @@ def download_dataset(
         Literal["mcap", "csv"], typer.Option(help="MCAP keeps units, holds and segments.")
     ] = "mcap",
     force: Force = False,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
 ) -> None:
     """Download a recording."""
-    with connect_client(url, key) as client:
-        found = find_dataset(client, dataset)
-        if file == STANDARD_INPUT:
-            _write_pieces(client.download(found["id"], format), sys.stdout.buffer)
-            return
-        target = file or Path(f"{found['name'].replace('/', '_')}.{format}")
-        protect_file(target, force)
-        with replace_file(target) as sink:
-            _write_pieces(client.download(found["id"], format), sink)
+    found = find_dataset(client, dataset)
+    if file == STANDARD_INPUT:
+        _write_pieces(client.download(found["id"], format), sys.stdout.buffer)
+        return
+    target = file or Path(f"{found['name'].replace('/', '_')}.{format}")
+    protect_file(target, force)
+    with replace_file(target) as sink:
+        _write_pieces(client.download(found["id"], format), sink)
     print_line(str(target))
 
 
@@ -204,7 +207,9 @@ def download_dataset(
         "lagid dataset simulate simulation.yaml",
     ),
 )
+@server_command(_print_dataset)
 def simulate_dataset(
+    client: "Client",
     file: Annotated[Path | None, typer.Argument(help=DOCUMENT_HELP)] = None,
     plant: Annotated[
         str | None, typer.Option(help="Reference plant instead of a model: actuator or tube.")
@@ -214,11 +219,7 @@ def simulate_dataset(
         typer.Option("--set", metavar="NAME=VALUE", help="A parameter, such as length_m=30."),
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the dataset.")] = None,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
+) -> Mapping[str, Any]:
     """Simulate a recording from a model or a reference plant, parameters, inputs and noise.
 
     Inputs that jump (step, binary) are stored as held between samples. Waves and expressions are
@@ -237,38 +238,31 @@ def simulate_dataset(
             for name, value in parse_pairs("--set", sets).items()
         }
         body["parameters"] = {**(body.get("parameters") or {}), **values}
-    with connect_client(url, key) as client, report_faults(_field_origins(file, sets)):
-        stored = client.simulate_dataset(body)
-    _print_dataset(stored, as_json)
+    with report_faults(_field_origins(file, sets)):
+        return client.simulate_dataset(body)
 
 
 @app.command(
     "derive", epilog=show_examples("lagid dataset derive recording steps.yaml --name trimmed")
 )
+@server_command(_print_dataset)
 def derive_dataset(
+    client: "Client",
     dataset: Annotated[str, typer.Argument(help="Id or name of the parent.")],
     file: Annotated[
         Path,
         typer.Argument(help="YAML or JSON file with the list of steps; - for standard input."),
     ],
     name: Annotated[str | None, typer.Option(help="Name of the new dataset.")] = None,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
+) -> Mapping[str, Any]:
     """Derive a recording from another: add noise, resample, trim, select, pool etc."""
     steps = read_document(file)
     if isinstance(steps, dict):
         steps = steps.get("steps")
     if not isinstance(steps, list):
         fail(f"{name_file(file)} has no list of steps, such as - detrend: {{}}")
-    with (
-        connect_client(url, key) as client,
-        report_faults(file_origins(file, {"/name": "--name"})),
-    ):
-        stored = client.derive(dataset, steps, name)
-    _print_dataset(stored, as_json)
+    with report_faults(file_origins(file, {"/name": "--name"})):
+        return client.derive(dataset, steps, name)
 
 
 def find_dataset(client: "Client", name: str) -> Mapping[str, Any]:
@@ -302,25 +296,6 @@ def _field_origins(file: Path | None, sets: list[str] | None) -> FieldOrigins:
     }
     options = {"/plant": "--plant", "/name": "--name", **named}
     return FieldOrigins(options) if file is None else file_origins(file, options)
-
-
-def _print_dataset(stored: Mapping[str, Any], as_json: bool) -> None:
-    if as_json:
-        print_json(stored)
-        return
-    period = stored["sample_time"]
-    sampling = "irregular sampling" if period is None else f"sampling period {period:.6g} s"
-    before = stored["details"].get("known_before")
-    history = f"known for {before:.6g} s before, " if before else ""
-    started = f"started at {stored['started_at']}, " if stored["started_at"] else ""
-    print_line(
-        f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, "
-        f"{started}{history}channels {_format_channels(stored)}"
-    )
-    for trend in stored["details"].get("subtracted") or ():
-        print_note(f"subtracted from {format_subtracted(trend)}")
-    for warning in stored["warnings"]:
-        print_note(warning)
 
 
 def _format_channels(dataset: Mapping[str, Any]) -> str:

@@ -7,18 +7,14 @@ import typer
 
 from service.cli.common import (
     OUTPUT_PANEL,
-    AsJson,
-    Key,
-    Url,
     ask_to_go_on,
-    connect_client,
     fail,
     fail_usage,
-    print_json,
     print_line,
+    server_command,
     show_examples,
 )
-from service.client.calls import DEFAULT_URL, Document, ProblemError
+from service.client.calls import Document, ProblemError
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -93,50 +89,39 @@ def add_item_commands(
     """
     argument = typer.Argument(metavar=kind.upper(), help=f"The {kind}, as lists show it.")
 
+    @server_command(_print_edited)
     def edit(
+        client: "Client",
         item: Annotated[str, argument],
         name: Annotated[str | None, typer.Option(help="New name.", hidden=not has_name)] = None,
         note: EditedNote = None,
         tags: EditedTags = None,
         no_tags: NoTags = False,
-        url: Url = DEFAULT_URL,
-        key: Key = None,
-        as_json: AsJson = False,
-    ) -> None:
+    ) -> Document:
         changes = _collect_changes(name, note, tags, no_tags)
-        with connect_client(url, key) as client:
-            identity = resolve(client, item) if resolve else item
-            answer = getattr(client, f"edit_{kind}")(identity, changes)
-        if as_json:
-            print_json(answer)
-            return
-        print_line(_describe_edited(answer))
+        identity = resolve(client, item) if resolve else item
+        edited: Document = getattr(client, f"edit_{kind}")(identity, changes)
+        return edited
 
+    @server_command(_print_deleted)
     def delete(
+        client: "Client",
         item: Annotated[str, argument],
         cascade: Cascade = False,
         yes: Yes = False,
-        url: Url = DEFAULT_URL,
-        key: Key = None,
-        as_json: AsJson = False,
-    ) -> None:
-        with connect_client(url, key) as client:
-            identity = resolve(client, item) if resolve else item
-            if not yes:
-                others = ", with everything that was made from it" if cascade else ""
-                ask_to_go_on(
-                    f"Delete {kind} {item}{others}?",
-                    "nothing was deleted, because nobody can answer here; add --yes",
-                )
-            try:
-                answer = getattr(client, f"delete_{kind}")(identity, cascade=cascade)
-            except ProblemError as error:
-                _explain_refusal(error)
-        if as_json:
-            print_json(answer)
-            return
-        for entry in answer["deleted"]:
-            print_line(f"deleted {entry['kind']} {entry['id']}  {entry['name']}")
+    ) -> Document:
+        identity = resolve(client, item) if resolve else item
+        if not yes:
+            others = ", with everything that was made from it" if cascade else ""
+            ask_to_go_on(
+                f"Delete {kind} {item}{others}?",
+                "nothing was deleted, because nobody can answer here; add --yes",
+            )
+        try:
+            deleted: Document = getattr(client, f"delete_{kind}")(identity, cascade=cascade)
+        except ProblemError as error:
+            _explain_refusal(error)
+        return deleted
 
     edit.__doc__ = f"Change {'name, ' if has_name else ''}note or tags of a {kind}."
     delete.__doc__ = f"Delete a {kind}; what was made from it is listed, and deleted by --cascade."
@@ -178,11 +163,16 @@ def _collect_changes(
     return changes
 
 
-def _describe_edited(answer: Document) -> str:
+def _print_edited(answer: Document) -> None:
     tags = f"  [{', '.join(answer['tags'])}]" if answer["tags"] else ""
     note = f"  {answer['note']}" if answer["note"] else ""
     names = [str(answer[field]) for field in ("id", "name") if field in answer]
-    return f"{'  '.join(names)}{tags}{note}"
+    print_line(f"{'  '.join(names)}{tags}{note}")
+
+
+def _print_deleted(answer: Document) -> None:
+    for entry in answer["deleted"]:
+        print_line(f"deleted {entry['kind']} {entry['id']}  {entry['name']}")
 
 
 def _explain_refusal(error: ProblemError) -> NoReturn:

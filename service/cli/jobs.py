@@ -8,16 +8,12 @@ import typer
 
 from service.cli.common import (
     MODEL_SUFFIXES,
-    AsJson,
+    Document,
     FieldOrigins,
     Force,
-    Key,
     Limit,
     Listing,
-    Quiet,
-    Url,
     check_succeeded,
-    connect_client,
     fail,
     fail_usage,
     fetch_listing,
@@ -29,6 +25,7 @@ from service.cli.common import (
     out,
     print_job,
     print_json,
+    print_line,
     print_listing,
     print_note,
     print_rest,
@@ -37,6 +34,7 @@ from service.cli.common import (
     read_document,
     read_object,
     report_faults,
+    server_command,
     write_file,
 )
 from service.cli.datasets import find_dataset
@@ -58,7 +56,6 @@ from service.cli.tables import (
     run_coordinates,
 )
 from service.cli.watch import follow_job
-from service.client.calls import DEFAULT_URL
 from service.core.states import JobState
 from service.formats.file_kinds import SUFFIXES
 from sysid.core.text import append_unit
@@ -83,7 +80,9 @@ app = typer.Typer(help="Edit and delete jobs.", no_args_is_help=True)
 add_item_commands(app, "lagid job", "job", "job_1", has_name=True)
 
 
+@server_command(print_job)
 def submit_job(
+    client: "Client",
     file: Annotated[
         Path,
         typer.Argument(metavar="JOB.yaml", help="The job, YAML or JSON; - for standard input."),
@@ -92,38 +91,27 @@ def submit_job(
     idempotency_key: Annotated[
         str | None, typer.Option(help="The same key returns the same job.")
     ] = None,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
+    as_json: bool = False,
+) -> Document | None:
     """Submit a job, described in a file, to the server."""
     body = read_job(file)
-    with connect_client(url, key) as client:
-        with report_faults(file_origins(file)):
-            job = client.submit(body, idempotency_key=idempotency_key)
-        if not wait:
-            if as_json:
-                print_json(job)
-            else:
-                print_job(job)
-            return
-        _print_end(client, follow_job(client, job["id"], quiet=as_json), as_json)
+    with report_faults(file_origins(file)):
+        job = client.submit(body, idempotency_key=idempotency_key)
+    if not wait:
+        return job
+    _print_end(client, follow_job(client, job["id"], quiet=as_json), as_json)
+    return None
 
 
-def watch_job(
-    job: JobName,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
+@server_command()
+def watch_job(client: "Client", job: JobName, as_json: bool = False) -> None:
     """Show a job's progress and RMS until it ends, then its estimates."""
-    with connect_client(url, key) as client:
-        _print_end(client, follow_job(client, job, quiet=as_json), as_json)
+    _print_end(client, follow_job(client, job, quiet=as_json), as_json)
 
 
+@server_command()
 def list_jobs(
+    client: "Client",
     state: Annotated[
         list[JobState] | None, typer.Option(help="Only jobs in this state; may be repeated.")
     ] = None,
@@ -141,24 +129,21 @@ def list_jobs(
     label: LabelFilter = None,
     since: Since = None,
     until: Until = None,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
     limit: Limit = None,
-    as_json: AsJson = False,
+    as_json: bool = False,
 ) -> None:
     """List the jobs of the server, latest first."""
-    with connect_client(url, key) as client:
-        filters = read_filters(
-            state=state,
-            name=name,
-            model=model,
-            dataset=[find_dataset(client, text)["id"] for text in dataset or ()],
-            tag=tag,
-            label=label,
-            since=since,
-            until=until,
-        )
-        listing = fetch_listing(lambda most: client.jobs(most, **filters), limit, as_json)
+    filters = read_filters(
+        state=state,
+        name=name,
+        model=model,
+        dataset=[find_dataset(client, text)["id"] for text in dataset or ()],
+        tag=tag,
+        label=label,
+        since=since,
+        until=until,
+    )
+    listing = fetch_listing(lambda most: client.jobs(most, **filters), limit, as_json)
     print_listing(
         listing,
         as_json,
@@ -183,7 +168,9 @@ def _explain_no_jobs(state: list[JobState] | None, filters: dict[str, Any]) -> s
     return "no such jobs" if filters else "no jobs; submit one: lagid submit job.yaml"
 
 
+@server_command()
 def list_runs(
+    client: "Client",
     job: Annotated[
         str | None,
         typer.Argument(metavar="[JOB|RUN]", help="Id of a job (default: the latest) or of a run."),
@@ -210,16 +197,13 @@ def list_runs(
     descending: Annotated[
         bool, typer.Option("--descending", help="The largest value first.")
     ] = False,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
     limit: Limit = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    as_json: bool = False,
 ) -> None:
     """List the runs of a job with their estimates, or show one run."""
     chosen = read_filters(state=state, cell=cell, label=label, tag=tag)
     sorting = read_filters(order=order, descending=descending)
-    with connect_client(url, key) as client, report_faults(RUN_FILTER_ORIGINS):
+    with report_faults(RUN_FILTER_ORIGINS):
         if job is not None and job.startswith("run_"):
             if chosen or sorting:
                 fail_usage(f"{job} is one run; name a job to choose or sort its runs")
@@ -244,45 +228,41 @@ def list_runs(
     print_rest(listing, as_json)
 
 
-def cancel_job(
-    job: JobName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
-) -> None:
+def _print_state(job: Document) -> None:
+    print_line(f"{job['id']} is {job['state']}")
+
+
+def _print_cancelled(job: Document) -> None:
+    if job["state"] == "running":
+        print_line(f"{job['id']} will be cancelled")
+    else:
+        _print_state(job)
+
+
+@server_command(_print_cancelled)
+def cancel_job(client: "Client", job: JobName) -> Document:
     """Cancel a job; results so far are kept."""
-    with connect_client(url, key) as client:
-        answer = client.cancel(job)
-    if as_json:
-        print_json(answer)
-        return
-    asked = "will be cancelled" if answer["state"] == "running" else f"is {answer['state']}"
-    out.print(f"{answer['id']} {asked}", markup=False)
+    return client.cancel(job)
 
 
-def resume_job(
-    job: JobName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
-) -> None:
+@server_command(_print_state)
+def resume_job(client: "Client", job: JobName) -> Document:
     """Queue a failed or cancelled job again; it continues where it stopped."""
-    with connect_client(url, key) as client:
-        answer = client.resume(job)
-    if as_json:
-        print_json(answer)
-        return
-    out.print(f"{answer['id']} is {answer['state']}", markup=False)
+    return client.resume(job)
 
 
+@server_command()
 def write_report(
+    client: "Client",
     job: JobName,
     file: Annotated[Path, typer.Option("--output", "--out", "-o", help="File to write.")] = Path(
         "report.html"
     ),
     force: Force = False,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
 ) -> None:
     """Write the report of a job as one HTML file."""
     protect_file(file, force)
-    with connect_client(url, key) as client:
-        text = client.report(job)
-    write_file(file, text)
+    write_file(file, client.report(job))
     out.print(str(file), markup=False)
 
 

@@ -2,18 +2,18 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from service.cli import common
 from service.cli.common import (
     AsJson,
+    Document,
     Key,
     Limit,
     Listing,
-    Url,
     complete_model_name,
-    connect_client,
     err,
     fail_usage,
     fetch_listing,
@@ -21,10 +21,12 @@ from service.cli.common import (
     name_file,
     out,
     print_json,
+    print_line,
     print_listing,
     read_file,
     read_object,
     report_faults,
+    server_command,
     show_examples,
 )
 from service.cli.items import (
@@ -35,9 +37,11 @@ from service.cli.items import (
     add_item_commands,
     read_filters,
 )
-from service.client.calls import DEFAULT_URL
 from service.core.documents import parse_yaml
 from service.core.errors import InvalidRequest
+
+if TYPE_CHECKING:
+    from service.client.client import Client
 
 app = typer.Typer(help="List, show, check and add models.", invoke_without_command=True)
 
@@ -79,7 +83,7 @@ def list_models(
         built_in = [model for model in _list_builtin_models() if part in model["name"]]
         listing = Listing(built_in[: limit or None], len(built_in[limit:]) if limit else 0)
     else:
-        with connect_client(url, key) as client:
+        with common.connect_client(url, key) as client:
             listing = fetch_listing(lambda most: client.models(most, **filters), limit, as_json)
     print_listing(
         listing,
@@ -123,7 +127,7 @@ def show_model(
     if url is None or name in load.catalogue():
         document = dict(load.copy_catalogue_document(name))
     else:
-        with connect_client(url, key) as client:
+        with common.connect_client(url, key) as client:
             document = client.model(name)["document"] or {}
     if as_json:
         print_json(document)
@@ -171,20 +175,12 @@ def _print_faults(file: Path, faults: list[dict[str, Any]], kind: str = "") -> N
 @app.command(
     "add", epilog=show_examples("lagid models add mine.yaml", "lagid models add - < mine.yaml")
 )
-def add_model(
-    file: ModelFile,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
-) -> None:
+@server_command(lambda stored: print_line(f"{stored['name']}@{stored['version']}"))
+def add_model(client: "Client", file: ModelFile) -> Document:
     """Store your own model on a server."""
     document = read_object(file, "a model (name, equations, …)")
-    with connect_client(url, key) as client, report_faults(file_origins(file)):
-        stored = client.add_model(document)
-    if as_json:
-        print_json(stored)
-        return
-    out.print(f"{stored['name']}@{stored['version']}", markup=False)
+    with report_faults(file_origins(file)):
+        return client.add_model(document)
 
 
 def _list_builtin_models() -> list[dict[str, Any]]:

@@ -13,17 +13,13 @@ import typer
 
 from service.cli.common import (
     OUTPUT_PANEL,
-    AsJson,
+    Document,
     FieldOrigins,
     Force,
-    Key,
     Limit,
     ModelName,
-    Quiet,
-    Url,
     apply_setting,
     check_succeeded,
-    connect_client,
     fail,
     fail_usage,
     fetch_listing,
@@ -39,6 +35,7 @@ from service.cli.common import (
     protect_file,
     read_model,
     report_faults,
+    server_command,
     show_examples,
     split_names,
     upload_origins,
@@ -54,7 +51,6 @@ from service.cli.items import (
 )
 from service.cli.tables import print_reuse_note, print_trend
 from service.cli.watch import follow_job
-from service.client.calls import DEFAULT_URL
 from service.core.text import format_labels
 from service.formats.file_kinds import SUFFIXES
 
@@ -110,7 +106,9 @@ TrendFile = Annotated[
 ]
 
 
+@server_command(print_job)
 def reidentify(
+    client: "Client",
     experiments: Experiments,
     model: ModelName,
     label: Label,
@@ -127,11 +125,8 @@ def reidentify(
     output: TrendFile = None,
     keep_outliers: KeepOutliers = False,
     force: Force = False,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
+    as_json: bool = False,
+) -> Document | None:
     """Identify one model on each recording of a batch: a trend over a label such as length.
 
     Each run starts at the reference, or at the result of its neighbour.
@@ -149,17 +144,16 @@ def reidentify(
     }
     for change in changes or []:
         apply_setting(body, change)
-    with connect_client(url, key) as client:
-        body["batch"] = _upload_batch(client, batch)
-        with report_faults(_field_origins(experiments)):
-            job = client.reidentify(body)
-        if not (wait or accept or output):
-            (print_json if as_json else print_job)(job)
-            return
-        ended = follow_job(client, job["id"], quiet=as_json)
-        _print_outcome(client, ended, output, keep_outliers=keep_outliers, as_json=as_json)
-        if accept is not None:
-            _accept_run(client, ended, accept, label, chosen, quiet=as_json)
+    body["batch"] = _upload_batch(client, batch)
+    with report_faults(_field_origins(experiments)):
+        job = client.reidentify(body)
+    if not (wait or accept or output):
+        return job
+    ended = follow_job(client, job["id"], quiet=as_json)
+    _print_outcome(client, ended, output, keep_outliers=keep_outliers, as_json=as_json)
+    if accept is not None:
+        _accept_run(client, ended, accept, label, chosen, quiet=as_json)
+    return None
 
 
 def _field_origins(experiments: list[str]) -> FieldOrigins:
@@ -273,20 +267,19 @@ ReferenceName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the 
 
 
 @app.command("list", epilog=show_examples("lagid references list"))
+@server_command()
 def list_references(
+    client: "Client",
     name: NamePart = None,
     tag: TagFilter = None,
     since: Since = None,
     until: Until = None,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
     limit: Limit = None,
-    as_json: AsJson = False,
+    as_json: bool = False,
 ) -> None:
     """List the current references."""
     filters = read_filters(name=name, tag=tag, since=since, until=until)
-    with connect_client(url, key) as client:
-        listing = fetch_listing(lambda most: client.references(most, **filters), limit, as_json)
+    listing = fetch_listing(lambda most: client.references(most, **filters), limit, as_json)
     print_listing(
         listing,
         as_json,
@@ -305,16 +298,7 @@ def list_references(
     )
 
 
-@app.command("show", epilog=show_examples("lagid references show tube"))
-def show_reference(
-    name: ReferenceName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
-) -> None:
-    """Show a reference and the runs accepted before it."""
-    with connect_client(url, key) as client:
-        reference = client.reference(name)
-    if as_json:
-        print_json(reference)
-        return
+def _print_reference(reference: Mapping[str, Any]) -> None:
     out.print(f"{reference['name']}: {_format_estimates(reference['estimates'])}", markup=False)
     if reference["labels"]:
         out.print(format_labels(reference["labels"]), markup=False)
@@ -325,31 +309,33 @@ def show_reference(
     print_table(("run", "accepted", "by", "note"), rows, empty="")
 
 
-@app.command(
-    "accept",
-    epilog=show_examples("lagid references accept tube run_1 --by 'A. Engineer' --note spring"),
-)
-def accept_reference(
-    name: ReferenceName,
-    run: Annotated[str, typer.Argument(metavar="RUN", help="Id of a run that succeeded.")],
-    by: Annotated[str | None, typer.Option(help="Who accepts it.")] = None,
-    note: Annotated[str | None, typer.Option(help="Why.")] = None,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
-) -> None:
-    """Accept a run as the reference of a name; the previous run stays in the history."""
-    with connect_client(url, key) as client, report_faults(REFERENCE_ORIGINS):
-        reference = client.accept_reference(name, run, by=by, note=note)
-    if as_json:
-        print_json(reference)
-        return
-    _print_accepted(reference)
+@app.command("show", epilog=show_examples("lagid references show tube"))
+@server_command(_print_reference)
+def show_reference(client: "Client", name: ReferenceName) -> Mapping[str, Any]:
+    """Show a reference and the runs accepted before it."""
+    return client.reference(name)
 
 
 def _print_accepted(reference: Mapping[str, Any]) -> None:
     before = f" (before: {reference['history'][0]['run']})" if reference["history"] else ""
     out.print(f"{reference['name']}: {reference['run']}{before}", markup=False)
+
+
+@app.command(
+    "accept",
+    epilog=show_examples("lagid references accept tube run_1 --by 'A. Engineer' --note spring"),
+)
+@server_command(_print_accepted)
+def accept_reference(
+    client: "Client",
+    name: ReferenceName,
+    run: Annotated[str, typer.Argument(metavar="RUN", help="Id of a run that succeeded.")],
+    by: Annotated[str | None, typer.Option(help="Who accepts it.")] = None,
+    note: Annotated[str | None, typer.Option(help="Why.")] = None,
+) -> Mapping[str, Any]:
+    """Accept a run as the reference of a name; the previous run stays in the history."""
+    with report_faults(REFERENCE_ORIGINS):
+        return client.accept_reference(name, run, by=by, note=note)
 
 
 def _format_estimates(estimates: Mapping[str, Any]) -> str:

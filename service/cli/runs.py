@@ -6,39 +6,37 @@ of a run for other programs.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer.core import TyperGroup
 
 from service.cli.common import (
     DOCUMENT_HELP,
-    AsJson,
+    Document,
     FieldOrigins,
     Force,
-    Key,
-    Quiet,
-    Url,
-    connect_client,
     fail_usage,
     file_origins,
     format_decimals,
     format_estimate,
     out,
-    print_json,
     print_note,
     print_table,
     protect_file,
     read_object,
     report_faults,
+    server_command,
     show_examples,
     write_file,
 )
 from service.cli.items import add_item_commands
 from service.cli.jobs import list_runs as listing
-from service.client.calls import DEFAULT_URL
 from sysid.core.text import format_p_value
 from sysid.core.units import multiply_units
+
+if TYPE_CHECKING:
+    from service.client.client import Client
 
 LIST_COMMAND = "list"
 PROFILE_ORIGINS = FieldOrigins({"/parameters": "PARAMETER", "/points": "--points"})
@@ -79,20 +77,7 @@ app.command(
 )(listing)
 
 
-@app.command("residuals", epilog=show_examples("lagid runs residuals run_1"))
-def show_residuals(
-    run: RunName,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
-    """Test whether a run's residuals are white and independent of the inputs."""
-    with connect_client(url, key) as client:
-        residuals = client.residuals(run)
-    if as_json:
-        print_json(residuals)
-        return
+def _print_residuals(residuals: Document) -> None:
     headings = (
         "test",
         "experiment",
@@ -111,24 +96,14 @@ def show_residuals(
         print_note(residuals["note"])
 
 
-@app.command("simulate", epilog=show_examples("lagid runs simulate run_1 loop.yaml"))
-def simulate_run(
-    run: RunName,
-    file: Annotated[Path, typer.Argument(help=DOCUMENT_HELP)],
-    max_points: Annotated[int, typer.Option(min=2, help="Most points per line.")] = 1000,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
-    """Simulate the identified model on a new input or under P, PI or PID control."""
-    body = read_object(file)
-    origins = file_origins(file, {"?max_points": "--max-points"})
-    with connect_client(url, key) as client, report_faults(origins):
-        simulation = client.simulate_run(run, body, max_points)
-    if as_json:
-        print_json(simulation)
-        return
+@app.command("residuals", epilog=show_examples("lagid runs residuals run_1"))
+@server_command(_print_residuals)
+def fetch_residuals(client: "Client", run: RunName) -> Document:
+    """Test whether a run's residuals are white and independent of the inputs."""
+    return client.residuals(run)
+
+
+def _print_simulation(simulation: Document) -> None:
     for output in simulation["outputs"]:
         values = [value for value in output["values"] if value is not None]
         out.print(
@@ -145,24 +120,21 @@ def simulate_run(
         out.print(f"stored as {simulation['dataset']['id']}", markup=False)
 
 
-@app.command("profile", epilog=show_examples("lagid runs profile run_1 L T --points 41"))
-def profile_run(
+@app.command("simulate", epilog=show_examples("lagid runs simulate run_1 loop.yaml"))
+@server_command(_print_simulation)
+def simulate_run(
+    client: "Client",
     run: RunName,
-    parameters: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="PARAMETER…", help="Parameters (default: all free ones)."),
-    ] = None,
-    points: Annotated[int, typer.Option(min=3, max=101, help="Values per parameter.")] = 21,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
-) -> None:
-    """Compute profile likelihoods: 95 % intervals, all other parameters re-estimated."""
-    with connect_client(url, key) as client, report_faults(PROFILE_ORIGINS):
-        answer = client.profile(run, *(parameters or ()), points=points)
-    if as_json:
-        print_json(answer)
-        return
+    file: Annotated[Path, typer.Argument(help=DOCUMENT_HELP)],
+    max_points: Annotated[int, typer.Option(min=2, help="Most points per line.")] = 1000,
+) -> Document:
+    """Simulate the identified model on a new input or under P, PI or PID control."""
+    body = read_object(file)
+    with report_faults(file_origins(file, {"?max_points": "--max-points"})):
+        return client.simulate_run(run, body, max_points)
+
+
+def _print_profiles(answer: Document) -> None:
     rows = [
         [
             profile["name"],
@@ -175,20 +147,23 @@ def profile_run(
     print_table(("parameter", "unit", ">estimate", ">from", ">to"), rows, empty="no parameters")
 
 
-@app.command("compare", epilog=show_examples("lagid runs compare run_1 run_2"))
-def compare_runs(
-    runs: Annotated[list[str], typer.Argument(metavar="RUN RUN…", help="Ids of two runs or more.")],
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
-    """Compare runs of several models on the same data."""
-    with connect_client(url, key) as client, report_faults(FieldOrigins({"/runs": "RUN"})):
-        comparison = client.compare(*runs)
-    if as_json:
-        print_json(comparison)
-        return
+@app.command("profile", epilog=show_examples("lagid runs profile run_1 L T --points 41"))
+@server_command(_print_profiles)
+def profile_run(
+    client: "Client",
+    run: RunName,
+    parameters: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="PARAMETER…", help="Parameters (default: all free ones)."),
+    ] = None,
+    points: Annotated[int, typer.Option(min=3, max=101, help="Values per parameter.")] = 21,
+) -> Document:
+    """Compute profile likelihoods: 95 % intervals, all other parameters re-estimated."""
+    with report_faults(PROFILE_ORIGINS):
+        return client.profile(run, *(parameters or ()), points=points)
+
+
+def _print_comparison(comparison: Document) -> None:
     headings = (
         "run",
         "model",
@@ -209,6 +184,17 @@ def compare_runs(
     )
     for note in comparison["notes"]:
         print_note(note)
+
+
+@app.command("compare", epilog=show_examples("lagid runs compare run_1 run_2"))
+@server_command(_print_comparison)
+def compare_runs(
+    client: "Client",
+    runs: Annotated[list[str], typer.Argument(metavar="RUN RUN…", help="Ids of two runs or more.")],
+) -> Document:
+    """Compare runs of several models on the same data."""
+    with report_faults(FieldOrigins({"/runs": "RUN"})):
+        return client.compare(*runs)
 
 
 def _print_step(metrics: Mapping[str, Any] | None) -> None:
@@ -313,7 +299,9 @@ def _format_percent(part: float | None) -> str | None:
 EXPORT_ORIGINS = FieldOrigins({"?format": "--format", "?pade_order": "--pade-order"})
 
 
+@server_command()
 def export_model(
+    client: "Client",
     run: Annotated[str, typer.Argument(metavar="RUN", help="Id of a run.")],
     format: Annotated[
         Literal["json", "python", "c", "control"] | None,
@@ -331,15 +319,13 @@ def export_model(
         ),
     ] = 3,
     force: Force = False,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
+    as_json: bool = False,
 ) -> None:
     """Write the identified model of a run for another program."""
     if as_json and format not in (None, "json"):
         fail_usage(f"--json prints the JSON document; leave out --format {format}")
     protect_file(output, force)
-    with connect_client(url, key) as client, report_faults(EXPORT_ORIGINS):
+    with report_faults(EXPORT_ORIGINS):
         text = client.export(run, format or "json", pade_order)
     if output is None or as_json:
         typer.echo(text, nl=False)

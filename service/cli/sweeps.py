@@ -7,15 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import (
-    AsJson,
+    Document,
     FieldOrigins,
-    Key,
     ModelName,
-    Quiet,
-    Url,
     apply_setting,
     check_succeeded,
-    connect_client,
     fail_usage,
     out,
     parse_channels,
@@ -27,11 +23,11 @@ from service.cli.common import (
     print_table,
     read_model,
     report_faults,
+    server_command,
     show_examples,
     split_names,
 )
 from service.cli.watch import follow_job
-from service.client.calls import DEFAULT_URL
 from service.core.job_fields import METHOD_PATH, SIGMA_PATH
 from service.sweeps.cramer_rao import scale_to_median
 from sysid.core.settings import SEARCH_METHODS
@@ -122,7 +118,9 @@ IdempotencyKey = Annotated[str | None, typer.Option(help="The same key returns t
         "lagid sweep noise --model mine.yaml --data recording --sigma 0,0.1,0.5",
     ),
 )
+@server_command(print_job)
 def sweep_noise(
+    client: "Client",
     model: ModelName,
     sigma: Sigma,
     data: Data = None,
@@ -139,11 +137,8 @@ def sweep_noise(
     name: Annotated[str | None, typer.Option(help="Name of the job.")] = None,
     wait: Wait = False,
     idempotency_key: IdempotencyKey = None,
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
+    as_json: bool = False,
+) -> Document | None:
     """Identify under noise: σ × replicates × methods; errors and Cramér–Rao bounds.
 
     The record is simulated (--true, --input, --samples, --sample-time) or a dataset (--data).
@@ -163,12 +158,13 @@ def sweep_noise(
     }
     for change in changes or []:
         apply_setting(body, change)
-    with connect_client(url, key) as client:
-        with report_faults(FIELD_ORIGINS):
-            job = client.noise_sweep(body, idempotency_key=idempotency_key)
-        if wait:
-            job = follow_job(client, job["id"], quiet=as_json)
-        _print_sweep(client, job, is_relative=relative, wait=wait, as_json=as_json)
+    with report_faults(FIELD_ORIGINS):
+        job = client.noise_sweep(body, idempotency_key=idempotency_key)
+    if not wait:
+        return job
+    ended = follow_job(client, job["id"], quiet=as_json)
+    _print_sweep(client, ended, is_relative=relative, as_json=as_json)
+    return None
 
 
 def parse_sigma_grid(text: str) -> list[float]:
@@ -281,14 +277,8 @@ def _error_cells(group: Mapping[str, Any], names: list[str]) -> list[str]:
 
 
 def _print_sweep(
-    client: "Client", job: Mapping[str, Any], *, is_relative: bool, wait: bool, as_json: bool
+    client: "Client", job: Mapping[str, Any], *, is_relative: bool, as_json: bool
 ) -> None:
-    if not wait:
-        if as_json:
-            print_json(job)
-        else:
-            print_job(job)
-        return
     summary = client.summary(job["id"], GROUP_KEYS[is_relative])
     if as_json:
         print_json({**job, "summary": summary})

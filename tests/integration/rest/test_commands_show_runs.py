@@ -11,6 +11,7 @@ from starlette.testclient import TestClient
 from typer.testing import CliRunner, Result
 
 from service.api.app import create_app
+from service.cli import common
 from service.cli.common import FieldOrigins
 from service.cli.main import build_program
 from service.cli.tables import print_trend
@@ -67,8 +68,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 @pytest.fixture(autouse=True)
 def connected(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("jobs", "runs", "datasets"):
-        monkeypatch.setattr(f"service.cli.{module}.connect_client", lambda *_: Again(served.client))
+    monkeypatch.setattr(common, "connect_client", lambda *_: Again(served.client))
 
 
 class Again:

@@ -3,11 +3,13 @@
 from collections.abc import Iterator
 from typing import Any
 
+import httpx
 import pytest
 from typer.testing import CliRunner
 
-from service.cli import reidentify
+from service.cli import common
 from service.cli.main import build_program
+from service.client.client import Client
 from service.trends import trend as trends
 from tests.batches import BODY, LENGTHS, ServedBatch, identify_batch, serve_batch
 from tests.integration.rest.test_rest_reidentify import quantity, run_at, trend
@@ -163,10 +165,11 @@ def test_the_same_equations_under_another_name_with_other_bounds_are_the_same_mo
 def test_a_run_that_cannot_be_accepted_is_told_before_anything_is_sent(
     monkeypatch: pytest.MonkeyPatch, words: list[str], said: str
 ) -> None:
-    def connected(*_: object) -> None:
+    def refuse_request(_: httpx.Request) -> httpx.Response:
         raise AssertionError("sent before it was checked")
 
-    monkeypatch.setattr(reidentify, "connect_client", connected)
+    client = Client(transport=httpx.MockTransport(refuse_request))
+    monkeypatch.setattr(common, "connect_client", lambda *_: client)
     told = CliRunner().invoke(
         build_program(), ["reidentify", "--model", "tube", "--label", "length_m", *words]
     )

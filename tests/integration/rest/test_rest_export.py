@@ -16,7 +16,7 @@ from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
 from service.api.app import create_app
-from service.cli import runs as run_commands
+from service.cli import common
 from service.cli.main import build_program
 from service.client.async_client import AsyncClient
 from service.client.calls import ProblemError
@@ -181,7 +181,7 @@ def test_the_command_writes_a_file_or_to_stdout(
     served: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     client = Client("http://testserver", transport=Through(served.server))
-    monkeypatch.setattr(run_commands, "connect_client", lambda *_: nullcontext(client))
+    monkeypatch.setattr(common, "connect_client", lambda *_: nullcontext(client))
     told = export(served, served.run, format="python").text
     run = CliRunner().invoke
     shown = run(build_program(), ["export", served.run, "--format", "python"])

@@ -11,7 +11,7 @@ from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
 from service.api.app import create_app
-from service.cli import runs
+from service.cli import common, runs
 from service.client.client import Client
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
@@ -287,7 +287,7 @@ def test_the_command_line_tells_controller_rule_and_margins(
     def connected(url: str, key: str | None) -> Client:
         return Client("http://testserver", transport=Through(served.server))
 
-    monkeypatch.setattr(runs, "connect_client", connected)
+    monkeypatch.setattr(common, "connect_client", connected)
     file = tmp_path / "loop.json"
 
     def told(**control: Any) -> str:

@@ -8,7 +8,7 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.cli import datasets
+from service.cli import common, datasets
 from service.client.client import Client
 from service.formats.mcap import read_mcap
 from sysid.data.records import Recording
@@ -126,7 +126,7 @@ def test_the_command_line_makes_a_tube_from_its_length(
     server: TestClient, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     client = Client("http://testserver", transport=Through(server))
-    monkeypatch.setattr(datasets, "connect_client", lambda url, key: client)
+    monkeypatch.setattr(common, "connect_client", lambda url, key: client)
     run = CliRunner().invoke
     file = tmp_path / "short.yaml"
     file.write_text("{samples: 100, parameters: {length_m: 10}}")

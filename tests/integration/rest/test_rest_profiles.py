@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 import service.runs.profiles
 from service.api.app import create_app
-from service.cli import runs as run_commands
+from service.cli import common
 from service.cli.runs import app as runs_app
 from service.client.client import Client
 from tests.identified import identified
@@ -141,7 +141,7 @@ def test_a_profile_that_cannot_be_had_is_refused(
 
 def test_the_command_tells_intervals(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        run_commands,
+        common,
         "connect_client",
         lambda *_: Client("http://testserver", transport=Through(served.server)),
     )

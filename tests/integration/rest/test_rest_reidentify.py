@@ -8,7 +8,7 @@ from urllib.parse import quote
 import pytest
 from typer.testing import CliRunner
 
-from service.cli import reidentify
+from service.cli import common
 from service.cli import reidentify as reidentifying
 from service.cli.main import build_program
 from service.client.client import Client
@@ -313,8 +313,7 @@ def command(served: ServedBatch, monkeypatch: pytest.MonkeyPatch) -> CliRunner:
         carried_out(served.parts, job)
         return opened.job(job)
 
-    for module in (reidentifying, reidentify):
-        monkeypatch.setattr(f"{module.__name__}.connect_client", connected)
+    monkeypatch.setattr(common, "connect_client", connected)
     monkeypatch.setattr(f"{reidentifying.__name__}.follow_job", follow)
     return CliRunner()
 

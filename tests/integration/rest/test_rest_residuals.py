@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from service.api.app import create_app
 from service.api.dependencies import Parts
-from service.cli import runs as run_commands
+from service.cli import common
 from service.cli.runs import app as runs_app
 from service.client.async_client import AsyncClient
 from service.client.client import Client
@@ -226,7 +226,7 @@ def test_where_the_inputs_are_lost_whiteness_is_told_all_the_same(
 def command(served: Served, monkeypatch: pytest.MonkeyPatch, *words: str, ends: int = 0) -> str:
     """What a command under ``lagid runs`` prints."""
     client = Client("http://testserver", transport=Through(served.server))
-    monkeypatch.setattr(run_commands, "connect_client", lambda url, key: nullcontext(client))
+    monkeypatch.setattr(common, "connect_client", lambda url, key: nullcontext(client))
     done = CliRunner().invoke(runs_app, list(words))
     assert done.exit_code == ends, done.output
     return done.output

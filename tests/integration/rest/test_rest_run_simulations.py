@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
 from service.api.app import create_app
-from service.cli import runs
+from service.cli import common, runs
 from service.client.client import Client
 from service.formats.mcap import read_mcap
 from tests.catalogue_cases import ACTUATOR
@@ -344,7 +344,7 @@ def test_the_command_line_tells_the_measures_of_the_step(
     def connected(url: str, key: str | None) -> Client:
         return Client("http://testserver", transport=Through(served.server))
 
-    monkeypatch.setattr(runs, "connect_client", connected)
+    monkeypatch.setattr(common, "connect_client", connected)
     file = tmp_path / "loop.json"
     file.write_text(json.dumps({**LOOP, "store": True}))
     done = CliRunner().invoke(runs.app, ["simulate", served.arm, str(file)])

@@ -6,8 +6,9 @@ from typing import Any
 import httpx
 import pytest
 import typer
+from typer.testing import CliRunner
 
-from service.cli import identify, runs, sweeps
+from service.cli import common, identify, sweeps
 from service.cli.common import (
     FieldOrigins,
     file_origins,
@@ -17,6 +18,7 @@ from service.cli.common import (
     print_table,
     report_faults,
 )
+from service.cli.main import build_program
 from service.client.calls import NotFinite, ProblemError
 from service.client.client import Client
 from service.core.errors import FieldError
@@ -149,12 +151,11 @@ def test_a_note_names_the_option_that_can_be_typed(
 
 
 def test_a_refused_export_is_told_at_its_option(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     fault = {"pointer": "?format", "detail": "'control' is not possible: a**3"}
     answer = httpx.Response(422, json={"title": "refused", "errors": [fault]})
     client = Client(transport=httpx.MockTransport(lambda _: answer))
-    monkeypatch.setattr(runs, "connect_client", lambda *_: client)
-    with pytest.raises(typer.Exit):
-        runs.export_model("run_1", "control")
-    assert capsys.readouterr().err == "lagid: --format: 'control' is not possible: a**3\n"
+    monkeypatch.setattr(common, "connect_client", lambda *_: client)
+    printed = CliRunner().invoke(build_program(), ["export", "run_1", "--format", "control"])
+    assert printed.stderr == "lagid: --format: 'control' is not possible: a**3\n"
