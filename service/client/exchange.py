@@ -151,9 +151,9 @@ class _Method(Generic[P, T]):
 
 def _present(function: Callable[..., T], model: Callable[..., Any], kind: Any) -> Callable[..., T]:
     """Give a function the name, docstring and parameters of another; it returns another `kind`."""
-    shown = signature(model)
     update_wrapper(function, model)
-    vars(function)["__signature__"] = shown.replace(return_annotation=kind)
+    function.__annotations__ = {**model.__annotations__, "return": kind}
+    vars(function)["__signature__"] = signature(model).replace(return_annotation=kind)
     return function
 
 
@@ -161,7 +161,7 @@ class Answered(_Method[P, T]):
     """A method with one answer."""
 
     def __init__(self, function: Callable[Concatenate[Any, P], Coroutine[Any, Any, T]]) -> None:
-        super().__init__(function, finish, signature(function).return_annotation)
+        super().__init__(function, finish, function.__annotations__["return"])
 
     @overload
     def __get__(self, client: Waiting, owner: type) -> Callable[P, T]: ...
@@ -177,8 +177,8 @@ class Iterated(_Method[P, T]):
     """A method with many answers, one after the other."""
 
     def __init__(self, function: Callable[Concatenate[Any, P], AsyncIterator[T]]) -> None:
-        (item, *_) = get_args(signature(function).return_annotation)
-        super().__init__(function, finish_each, GenericAlias(Iterator, item))
+        kind = GenericAlias(Iterator, _get_content(function))
+        super().__init__(function, finish_each, kind)
 
     @overload
     def __get__(self, client: Waiting, owner: type) -> Callable[P, Iterator[T]]: ...
@@ -192,7 +192,7 @@ class Iterated(_Method[P, T]):
 
 def fetch(operation: Operation[P, T]) -> Answered[P, T]:
     """Make a method that returns the answer: text, bytes, or else what JSON holds."""
-    kind = _get_answer(operation)
+    kind = _get_content(operation)
 
     async def ask(client: Exchange, *given: P.args, **options: P.kwargs) -> T:
         return await client._fetch(operation(client, *given, **options), kind)
@@ -206,7 +206,7 @@ def collect(operation: Operation[P, T]) -> Answered[P, Rows[T]]:
     async def ask(client: Exchange, *given: P.args, **options: P.kwargs) -> Rows[T]:
         return await client._collect(operation(client, *given, **options))
 
-    return Answered(_present(ask, operation, GenericAlias(Rows, _get_answer(operation))))
+    return Answered(_present(ask, operation, GenericAlias(Rows, _get_content(operation))))
 
 
 def iterate(operation: Operation[P, T]) -> Iterated[P, T]:
@@ -215,7 +215,7 @@ def iterate(operation: Operation[P, T]) -> Iterated[P, T]:
     def ask(client: Exchange, *given: P.args, **options: P.kwargs) -> AsyncIterator[T]:
         return client._iterate(operation(client, *given, **options))
 
-    return Iterated(_present(ask, operation, GenericAlias(AsyncIterator, _get_answer(operation))))
+    return Iterated(_present(ask, operation, GenericAlias(AsyncIterator, _get_content(operation))))
 
 
 def fetch_pieces(operation: Operation[P, bytes]) -> Iterated[P, bytes]:
@@ -227,5 +227,6 @@ def fetch_pieces(operation: Operation[P, bytes]) -> Iterated[P, bytes]:
     return Iterated(_present(ask, operation, AsyncIterator[bytes]))
 
 
-def _get_answer(operation: Callable[..., RestCall[Any]]) -> Any:
-    return get_args(operation.__annotations__["return"])[0]
+def _get_content(function: Callable[..., Any]) -> Any:
+    """Get the type in the brackets of what a function returns, such as that of an answer."""
+    return get_args(function.__annotations__["return"])[0]

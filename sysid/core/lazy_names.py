@@ -1,35 +1,58 @@
 """Load on first use: public names of a package, and libraries that a user may not have."""
 
-import sys
-from collections.abc import Callable, Mapping
+import builtins
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
+from types import SimpleNamespace
 from typing import Any
 
 
-def load_on_first_use(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Make the function `__getattr__` of a package.
+@contextmanager
+def load_on_first_use(package: dict[str, Any]) -> Iterator[None]:
+    """Put off the imports of a block until their names are used; they are the public ones.
+
+    Type checkers and editors see plain imports. None of them is carried out: Python is given a
+    stand-in for each module, and the package finds its names when somebody asks for one.
 
     Parameters
     ----------
-    package : str
-    modules : mapping of str to str
-        Public name → module that defines it.
+    package : dict of str to Any
+        The ``globals()`` of the package.
 
     Examples
     --------
-    >>> load_name = load_on_first_use("sysid.core", {"sqrt": "math"})
-    >>> load_name("sqrt")(9.0)
-    3.0
+    >>> with load_on_first_use(globals()):
+    ...     from math import sqrt
+    >>> "sqrt" in globals(), __all__
+    (False, ['sqrt'])
     """
+    modules: dict[str, str] = {}
+    import_as_usual = builtins.__import__
+
+    def note_import(
+        module: str, scope: Any = None, local: Any = None, names: Any = (), level: int = 0
+    ) -> Any:
+        if scope is not package:  # another thread imports meanwhile
+            return import_as_usual(module, scope, local, names, level)
+        public = import_module(module).__all__ if names == ("*",) else names
+        modules.update(dict.fromkeys(public, module))
+        return SimpleNamespace(__all__=public, **dict.fromkeys(public))
 
     def load_name(name: str) -> Any:
         if name not in modules:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(import_module(modules[name]), name)
-        setattr(sys.modules[package], name, value)  # the next use finds it there
-        return value
+            raise AttributeError(f"module {package['__name__']!r} has no attribute {name!r}")
+        package[name] = getattr(import_module(modules[name]), name)  # the next use finds it there
+        return package[name]
 
-    return load_name
+    vars(builtins)["__import__"] = note_import
+    try:
+        yield
+    finally:
+        vars(builtins)["__import__"] = import_as_usual
+    for name in modules:
+        del package[name]
+    package |= {"__all__": sorted(modules), "__getattr__": load_name}
 
 
 def load_library(name: str, call: str) -> Any:
