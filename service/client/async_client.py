@@ -9,7 +9,7 @@ import httpx
 
 from service.client import calls, operations
 from service.client.calls import RestCall
-from service.client.exchange import Awaited, iterate
+from service.client.methods import Awaited, iterate
 from service.client.operations import Operations
 
 BLOCK_BYTES = 1 << 20

@@ -5,7 +5,6 @@ It also holds the errors of the clients, the events of a job, and when a call is
 
 import json
 import os
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -255,47 +254,23 @@ def raise_for_problem(response: "httpx.Response") -> "httpx.Response":
 
 
 class EventParser:
-    """Parses server-sent events line by line, over one stream after the other.
+    """Parses the lines of a stream of server-sent events."""
 
-    Attributes
-    ----------
-    last : str or None
-        Id of the last event; the next stream begins after it.
-    is_over : bool
-        Whether there is no further event, or too many streams broke in succession.
-    """
-
-    def __init__(self, last: str | None, retries: int) -> None:
-        self.last, self.is_over = last, False
-        self._retries, self._losses = retries, 0
+    def __init__(self) -> None:
         self._fields: dict[str, str] = {}
 
-    def feed_line(self, line: str) -> Iterator[Document]:
-        """Take one line; yield the event that it completes, with its data decoded from JSON."""
+    def feed_line(self, line: str) -> Document | None:
+        """Take one line; return the event that it completes, with its data decoded from JSON."""
         if line:
             key, _, value = line.partition(":")
             if key:  # a line that begins with a colon is a comment that keeps the line open
                 self._fields[key] = value.removeprefix(" ")
-            return
+            return None
         fields, self._fields = self._fields, {}
-        if "data" in fields:
-            kind = fields.get("event", "message")
-            self.last, self._losses = fields.get("id"), 0
-            self.is_over = kind == "end"
-            yield {"id": self.last, "event": kind, "data": json.loads(fields["data"])}
-
-    def check_loss(self, error: ServerUnreachable) -> None:
-        """Raise the error of a broken stream if too many broke in succession."""
-        if self._losses >= self._retries:
-            raise error
-
-    def note_close(self, status: int) -> bool:
-        """Note the end of a stream; return whether another one may have further events."""
-        self._fields = {}
-        self._losses += 1
-        if status == HTTPStatus.NO_CONTENT or self._losses > self._retries:
-            self.is_over = True
-        return not self.is_over
+        if "data" not in fields:
+            return None
+        kind = fields.get("event", "message")
+        return {"id": fields.get("id"), "event": kind, "data": json.loads(fields["data"])}
 
 
 def _describe_fault(entry: Mapping[str, Any]) -> str:
@@ -341,28 +316,6 @@ def choose_pause(response: "httpx.Response", pauses: "Iterator[float]") -> float
     requested = _parse_retry_after(response.headers.get("Retry-After"))
     pause = pause if requested is None else requested
     return pause if pause <= MAX_PAUSE_SECONDS else None
-
-
-class WaitLimit:
-    """The time until which a job is waited for."""
-
-    def __init__(self, seconds: float | None) -> None:
-        self._seconds, self._start = seconds, time.monotonic()
-
-    def shorten(self, pause: float, job: "documents.JobDocument") -> float:
-        """Return a pause that ends in time.
-
-        Raises
-        ------
-        WaitTimeout
-            If no time is left.
-        """
-        if self._seconds is None:
-            return pause
-        left = self._start + self._seconds - time.monotonic()
-        if left <= 0:
-            raise WaitTimeout(job, self._seconds)
-        return min(pause, left)
 
 
 def _parse_retry_after(header: str | None) -> float | None:

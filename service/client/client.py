@@ -10,7 +10,7 @@ import httpx
 
 from service.client import calls, operations
 from service.client.calls import RestCall
-from service.client.exchange import Waiting, collect
+from service.client.methods import Waiting, collect
 from service.client.operations import Operations
 
 Piece = TypeVar("Piece")

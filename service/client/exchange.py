@@ -1,16 +1,13 @@
 """How a call gets its answer, once for both clients: repeats, pages, pieces of a file.
 
-It is written with ``await`` and does no input or output of its own. The steps of the synchronous
-client never wait, so `finish` carries out at once what both clients do.
+It is written with ``await``, and leaves input and output to five steps of a client. Those of the
+synchronous client never wait.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator
 from dataclasses import replace
-from functools import update_wrapper
-from inspect import signature
-from types import GenericAlias, MethodType
-from typing import Any, Concatenate, Generic, ParamSpec, TypeAlias, TypeVar, get_args, overload
+from typing import Any, TypeVar
 
 import httpx
 
@@ -18,10 +15,7 @@ from service.client import calls
 from service.client.calls import RestCall, ServerUnreachable
 from service.client.rows import Rows
 
-P = ParamSpec("P")
-T = TypeVar("T")
-Operation: TypeAlias = Callable[Concatenate[Any, P], RestCall[T]]
-
+Answer = TypeVar("Answer")
 
 PAGE_SIZE = 500
 
@@ -34,19 +28,24 @@ class Exchange(ABC):
         self._has_answered = False
 
     @abstractmethod
-    async def _send_once(self, call: RestCall[Any], stream: bool) -> httpx.Response: ...
+    async def _send_once(self, call: RestCall[Any], stream: bool) -> httpx.Response:
+        """Send a request, and read its answer unless it is a stream; a refusal is read."""
 
     @abstractmethod
-    async def _pause(self, seconds: float) -> None: ...
+    async def _pause(self, seconds: float) -> None:
+        """Let so much time pass."""
 
     @abstractmethod
-    def _read_pieces(self, response: httpx.Response) -> AsyncIterator[bytes]: ...
+    def _read_pieces(self, response: httpx.Response) -> AsyncIterator[bytes]:
+        """Read a stream piece by piece, as it comes."""
 
     @abstractmethod
-    def _read_lines(self, response: httpx.Response) -> AsyncIterator[str]: ...
+    def _read_lines(self, response: httpx.Response) -> AsyncIterator[str]:
+        """Read a stream line by line, as it comes."""
 
     @abstractmethod
-    async def _end_stream(self, response: httpx.Response) -> None: ...
+    async def _end_stream(self, response: httpx.Response) -> None:
+        """Give the connection of a stream back."""
 
     async def _send(self, call: RestCall[Any], stream: bool = False) -> httpx.Response:
         pauses = calls.plan_pauses(call, self._retries)
@@ -70,13 +69,14 @@ class Exchange(ABC):
             return self._has_answered
         return not isinstance(error, httpx.TimeoutException)
 
-    async def _fetch(self, call: RestCall[T], kind: Any = None) -> T:
+    async def _fetch(self, call: RestCall[Answer], kind: Any = None) -> Answer:
+        """Return the answer of a kind: `str`, `bytes`, or else a document of JSON."""
         response = await self._send(call)
         form = {str: "text", bytes: "content"}.get(kind)
-        answer: T = getattr(response, form) if form else response.json()
+        answer: Answer = getattr(response, form) if form else response.json()
         return answer
 
-    async def _iterate(self, call: RestCall[T]) -> AsyncGenerator[T, None]:
+    async def _iterate(self, call: RestCall[Answer]) -> AsyncIterator[Answer]:
         left, position = call.at_most, {"limit": min(call.at_most or PAGE_SIZE, PAGE_SIZE)}
         while True:
             page = (await self._send(replace(call, params={**call.params, **position}))).json()
@@ -88,10 +88,10 @@ class Exchange(ABC):
                 return
             position["cursor"] = page["next"]
 
-    async def _collect(self, call: RestCall[T]) -> Rows[T]:
+    async def _collect(self, call: RestCall[Answer]) -> Rows[Answer]:
         return Rows([item async for item in self._iterate(call)])
 
-    async def _download(self, call: RestCall[bytes]) -> AsyncGenerator[bytes, None]:
+    async def _download(self, call: RestCall[bytes]) -> AsyncIterator[bytes]:
         response = await self._send(call, stream=True)
         try:
             async for piece in self._read_pieces(response):
@@ -100,133 +100,3 @@ class Exchange(ABC):
             raise ServerUnreachable(self.url, error) from error
         finally:
             await self._end_stream(response)
-
-
-class Waiting:
-    """A client whose methods wait for their answers."""
-
-
-class Awaited:
-    """A client whose methods are awaited, or iterated with ``async for``."""
-
-
-def finish(work: Coroutine[Any, Any, T]) -> T:
-    """Carry out a coroutine that never waits."""
-    try:
-        work.send(None)
-    except StopIteration as end:
-        result: T = end.value
-        return result
-    raise RuntimeError("a step of the synchronous client waited")
-
-
-def finish_each(items: AsyncGenerator[T, None]) -> Iterator[T]:
-    """Iterate over an asynchronous generator that never waits."""
-    try:
-        while True:
-            try:
-                item = finish(items.__anext__())
-            except StopAsyncIteration:
-                return
-            yield item
-    finally:
-        finish(items.aclose())
-
-
-class _Method(Generic[P, T]):
-    """A function of both clients: as it is for one, finished at once for the other."""
-
-    def __init__(self, function: Callable[..., Any], finish: Callable[..., Any], kind: Any) -> None:
-        def finish_function(*given: Any, **options: Any) -> Any:
-            return finish(function(*given, **options))
-
-        self._awaited = function
-        self._waiting = _present(finish_function, function, kind)
-
-    def bind(self, client: Any, owner: type) -> Any:
-        """Return the function of a client's class, as its method if there is a client."""
-        function = self._waiting if issubclass(owner, Waiting) else self._awaited
-        return function if client is None else MethodType(function, client)
-
-
-def _present(function: Callable[..., T], model: Callable[..., Any], kind: Any) -> Callable[..., T]:
-    """Give a function the name, docstring and parameters of another; it returns another `kind`."""
-    update_wrapper(function, model)
-    function.__annotations__ = {**model.__annotations__, "return": kind}
-    vars(function)["__signature__"] = signature(model).replace(return_annotation=kind)
-    return function
-
-
-class Answered(_Method[P, T]):
-    """A method with one answer."""
-
-    def __init__(self, function: Callable[Concatenate[Any, P], Coroutine[Any, Any, T]]) -> None:
-        super().__init__(function, finish, function.__annotations__["return"])
-
-    @overload
-    def __get__(self, client: Waiting, owner: type) -> Callable[P, T]: ...
-    @overload
-    def __get__(self, client: Awaited, owner: type) -> Callable[P, Coroutine[Any, Any, T]]: ...
-    @overload
-    def __get__(self, client: None, owner: type) -> Callable[..., Any]: ...
-    def __get__(self, client: Any, owner: type) -> Any:
-        return self.bind(client, owner)
-
-
-class Iterated(_Method[P, T]):
-    """A method with many answers, one after the other."""
-
-    def __init__(self, function: Callable[Concatenate[Any, P], AsyncIterator[T]]) -> None:
-        kind = GenericAlias(Iterator, _get_content(function))
-        super().__init__(function, finish_each, kind)
-
-    @overload
-    def __get__(self, client: Waiting, owner: type) -> Callable[P, Iterator[T]]: ...
-    @overload
-    def __get__(self, client: Awaited, owner: type) -> Callable[P, AsyncIterator[T]]: ...
-    @overload
-    def __get__(self, client: None, owner: type) -> Callable[..., Any]: ...
-    def __get__(self, client: Any, owner: type) -> Any:
-        return self.bind(client, owner)
-
-
-def fetch(operation: Operation[P, T]) -> Answered[P, T]:
-    """Make a method that returns the answer: text, bytes, or else what JSON holds."""
-    kind = _get_content(operation)
-
-    async def ask(client: Exchange, *given: P.args, **options: P.kwargs) -> T:
-        return await client._fetch(operation(client, *given, **options), kind)
-
-    return Answered(_present(ask, operation, kind))
-
-
-def collect(operation: Operation[P, T]) -> Answered[P, Rows[T]]:
-    """Make a method that returns the items of a list."""
-
-    async def ask(client: Exchange, *given: P.args, **options: P.kwargs) -> Rows[T]:
-        return await client._collect(operation(client, *given, **options))
-
-    return Answered(_present(ask, operation, GenericAlias(Rows, _get_content(operation))))
-
-
-def iterate(operation: Operation[P, T]) -> Iterated[P, T]:
-    """Make a method that iterates over the items of a list, a page at a time."""
-
-    def ask(client: Exchange, *given: P.args, **options: P.kwargs) -> AsyncIterator[T]:
-        return client._iterate(operation(client, *given, **options))
-
-    return Iterated(_present(ask, operation, GenericAlias(AsyncIterator, _get_content(operation))))
-
-
-def fetch_pieces(operation: Operation[P, bytes]) -> Iterated[P, bytes]:
-    """Make a method that gives a file piece by piece."""
-
-    def ask(client: Exchange, *given: P.args, **options: P.kwargs) -> AsyncIterator[bytes]:
-        return client._download(operation(client, *given, **options))
-
-    return Iterated(_present(ask, operation, AsyncIterator[bytes]))
-
-
-def _get_content(function: Callable[..., Any]) -> Any:
-    """Get the type in the brackets of what a function returns, such as that of an answer."""
-    return get_args(function.__annotations__["return"])[0]

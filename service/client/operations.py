@@ -2,10 +2,14 @@
 
 An operation returns the call of a route and the type of its answer. The decorator makes a method
 of it: for `Client` one that waits, for `AsyncClient` one that is awaited. Types are those of
-`service.client.documents`, for editors and type checkers.
+`service.client.documents`, for editors and type checkers. A slash after `self` leaves all names to
+the filters.
 """
 
+import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from http import HTTPStatus
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +24,15 @@ from service.client.calls import (
     EventParser,
     RestCall,
     ServerUnreachable,
-    WaitLimit,
+    WaitTimeout,
     build_edit,
     build_event_stream,
     build_submission,
     build_upload,
     call,
 )
-from service.client.exchange import (
-    Answered,
-    Exchange,
-    Iterated,
-    collect,
-    fetch,
-    fetch_pieces,
-    iterate,
-)
+from service.client.exchange import Exchange
+from service.client.methods import Answered, Iterated, collect, fetch, fetch_pieces, iterate
 from service.client.progress import show_progress
 
 
@@ -309,7 +306,7 @@ class Operations(Exchange):
         WaitTimeout
             If the job has not ended in time.
         """
-        limit = WaitLimit(timeout)
+        start, limit = time.monotonic(), inf if timeout is None else timeout
         with show_progress(job, is_shown=bar) as advance:
             while True:
                 state: documents.JobDocument = await self._fetch(call("GET /v1/jobs/{}", job))
@@ -318,7 +315,10 @@ class Operations(Exchange):
                     progress(state)
                 if state["state"] in TERMINAL_STATES:
                     return state
-                await self._pause(limit.shorten(poll, state))
+                left = start + limit - time.monotonic()
+                if left <= 0:
+                    raise WaitTimeout(state, limit)
+                await self._pause(min(poll, left))
 
     @Iterated
     async def events(self, job: str, after: str | None = None) -> AsyncIterator[Document]:
@@ -332,18 +332,24 @@ class Operations(Exchange):
         ServerUnreachable
             If the server stays silent, or too many streams break in succession.
         """
-        events = EventParser(after, self._retries)
-        while not events.is_over:
-            stream = await self._send(build_event_stream(job, events.last), stream=True)
+        losses, is_over = 0, False
+        while not is_over:
+            parser = EventParser()
+            stream = await self._send(build_event_stream(job, after), stream=True)
             try:
                 async for line in self._read_lines(stream):
-                    for event in events.feed_line(line):
+                    if event := parser.feed_line(line):
+                        after, losses, is_over = event["id"], 0, event["event"] == "end"
                         yield event
             except httpx.TransportError as error:
-                events.check_loss(ServerUnreachable(self.url, error))
+                if losses >= self._retries:
+                    raise ServerUnreachable(self.url, error) from error
             finally:
                 await self._end_stream(stream)
-            if events.note_close(stream.status_code):
+            losses += 1
+            is_closed = stream.status_code == HTTPStatus.NO_CONTENT  # there is no further event
+            is_over = is_over or is_closed or losses > self._retries
+            if not is_over:
                 await self._pause(FIRST_PAUSE_SECONDS)
 
     # ---- runs

@@ -1,9 +1,10 @@
 """Methods of the clients: settings, waiting, lists, and one method for each route."""
 
+import asyncio
 import inspect
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -14,6 +15,7 @@ from service.api.write_contract import DOCUMENT_FILE
 from service.client.async_client import AsyncClient
 from service.client.calls import ClientError, WaitTimeout, choose_key
 from service.client.client import Client
+from service.client.methods import finish
 from service.client.rows import Rows
 from tests.repository import ROOT
 from tests.rest import awaited
@@ -235,18 +237,50 @@ def test_a_list_of_runs_becomes_a_table() -> None:
     assert table.loc[0, "cell./seed"] == 1
 
 
-def test_a_download_is_given_piece_by_piece() -> None:
-    class Pieces(httpx.SyncByteStream):
-        read = 0
+class Pieces(httpx.SyncByteStream):
+    """Five pieces of a file; notes how many were read, and whether the stream was closed."""
 
-        def __iter__(self) -> Any:
-            for _ in range(5):
-                self.read += 1
-                yield b"0123456789"
+    read, is_closed = 0, False
 
+    def __iter__(self) -> Iterator[bytes]:
+        for _ in range(5):
+            self.read += 1
+            yield b"0123456789"
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+def test_a_download_is_given_piece_by_piece_and_may_be_left() -> None:
     pieces = Pieces()
     transport = httpx.MockTransport(lambda _: httpx.Response(200, stream=pieces))
     with Client("http://here", transport=transport) as client:
         download = client.download_signals("run_1")
-        assert next(iter(download)) == b"0123456789"
+        assert next(download) == b"0123456789"
         assert pieces.read < 5
+        assert not pieces.is_closed
+        del download  # as a loop that is left
+        assert pieces.is_closed
+
+
+def test_a_client_that_waits_works_where_a_loop_runs_as_in_a_notebook() -> None:
+    async def work() -> list[Any]:
+        pieces = Pieces()
+        transport = httpx.MockTransport(
+            lambda request: (
+                httpx.Response(200, stream=pieces)
+                if request.url.path.endswith(".mcap")
+                else answer_anything(request)
+            )
+        )
+        with Client("http://here", transport=transport) as client:
+            first = next(client.download_signals("run_1"))
+            assert pieces.is_closed
+            return [first, client.job("x")["id"], *client.iterate_jobs()]
+
+    assert awaited(work) == [b"0123456789", "x"]
+
+
+def test_a_step_that_waits_is_no_step_of_the_synchronous_client() -> None:
+    with pytest.raises(RuntimeError, match="waited"):
+        finish(asyncio.sleep(0))
