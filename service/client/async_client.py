@@ -49,6 +49,7 @@ class AsyncClient(Awaited, Operations):
         await self._http.aclose()
 
     runs = iterate(operations.runs)
+    """All runs of a job, or the first `at_most` that pass the filters, one after the other."""
 
     async def _send_once(self, call: RestCall[Any], stream: bool) -> httpx.Response:
         content = _read_blocks(call.content) if isinstance(call.content, Path) else call.content

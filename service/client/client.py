@@ -74,6 +74,7 @@ class Client(Waiting, Operations):
         self._http.close()
 
     runs = collect(operations.runs)
+    """All runs of a job, or the first `at_most` that pass the filters, as a list."""
 
     async def _send_once(self, call: RestCall[Any], stream: bool) -> httpx.Response:
         source = call.content
