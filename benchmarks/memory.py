@@ -9,7 +9,7 @@ from typing import Any
 from benchmarks import paper_example
 from benchmarks.family import memory_megabytes
 from benchmarks.table import Row, parser, report
-from service.client import calls
+from service.client.calls import RestCall, call
 from service.client.client import Client
 from service.client.embedded import run_embedded_service
 
@@ -24,10 +24,10 @@ def body(dataset: str, runs: int) -> dict[str, Any]:
     return {**paper_example.job(dataset, 0), "algorithm": SMALL, "sweep": {"axes": axes}}
 
 
-def milliseconds(client: Client, call: calls.RestCall) -> float:
+def milliseconds(client: Client, request: RestCall) -> float:
     """Time of one request, its answer read."""
     start = time.perf_counter()
-    client.send(call)
+    client.send(request)
     return 1e3 * (time.perf_counter() - start)
 
 
@@ -51,8 +51,8 @@ def main() -> None:
         state = "queued"
         while state in ("queued", "running"):
             time.sleep(BETWEEN_SECONDS)
-            waits["progress"].append(milliseconds(client, calls.JOB(job)))
-            waits["list"].append(milliseconds(client, calls.RUNS(job, limit=50)))
+            waits["progress"].append(milliseconds(client, call("GET /v1/jobs/{}", job)))
+            waits["list"].append(milliseconds(client, call("GET /v1/jobs/{}/runs", job, limit=50)))
             for name, size in memory_megabytes().items():
                 peaks[name] = max(peaks.get(name, 0.0), size)
             state = client.job(job)["state"]

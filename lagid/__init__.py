@@ -21,101 +21,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from service.client import (
-        AsyncClient,
-        Client,
-        ClientError,
-        NotFinite,
-        ProblemError,
-        ServerUnreachable,
-        WaitTimeout,
-    )
-    from service.formats.recordings import read_recording
-    from sysid import (
-        Channel,
-        DivergedEverywhere,
-        Estimate,
-        GeneticAlgorithm,
-        History,
-        Identification,
-        InvalidModel,
-        InvalidRecord,
-        InvalidSettings,
-        IslandChange,
-        Loss,
-        Migration,
-        MissingLibrary,
-        Noise,
-        NothingIdentifiable,
-        Parameter,
-        Problem,
-        ReadingNote,
-        Record,
-        Recording,
-        RecordTooShort,
-        SequenceSearch,
-        Stop,
-        SysidError,
-        UnknownModel,
-        UnknownParameter,
-        UnreadableFile,
-        UnreadableResult,
-        UnwritableFile,
-        catalogue,
-        export_model,
-        identify,
-        load_identified,
-        load_model,
-        simulate,
-    )
-
-__all__ = [
-    "AsyncClient",
-    "Channel",
-    "Client",
-    "ClientError",
-    "DivergedEverywhere",
-    "Estimate",
-    "GeneticAlgorithm",
-    "History",
-    "Identification",
-    "InvalidModel",
-    "InvalidRecord",
-    "InvalidSettings",
-    "IslandChange",
-    "Loss",
-    "Migration",
-    "MissingLibrary",
-    "Noise",
-    "NotFinite",
-    "NothingIdentifiable",
-    "Parameter",
-    "Problem",
-    "ProblemError",
-    "ReadingNote",
-    "Record",
-    "RecordTooShort",
-    "Recording",
-    "SequenceSearch",
-    "ServerUnreachable",
-    "Stop",
-    "SysidError",
-    "UnknownModel",
-    "UnknownParameter",
-    "UnreadableFile",
-    "UnreadableResult",
-    "UnwritableFile",
-    "WaitTimeout",
-    "catalogue",
-    "export_model",
-    "identify",
-    "load_identified",
-    "load_model",
-    "read_recording",
-    "simulate",
-]
-
 __version__ = "0.1.0"
 
 _DISTRIBUTION = "lagid"
@@ -125,7 +30,7 @@ _ALLOCATIONS_UNTIL_COLLECTION = 50_000
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
+    return [*globals()["__all__"], "__version__"]
 
 
 def main() -> None:
@@ -173,20 +78,17 @@ if (_clash := _describe_clash()) is not None:
         sys.exit(f"lagid: {_clash}")
     raise ImportError(_clash)
 
-from sysid.core.lazy_names import load_on_first_use  # noqa: E402  # `sysid` is that of lagid
+if TYPE_CHECKING:
+    from service.client.async_client import AsyncClient as AsyncClient
+    from service.client.calls import ClientError as ClientError
+    from service.client.calls import NotFinite as NotFinite
+    from service.client.calls import ProblemError as ProblemError
+    from service.client.calls import ServerUnreachable as ServerUnreachable
+    from service.client.calls import WaitTimeout as WaitTimeout
+    from service.client.client import Client as Client
+    from service.formats.recordings import read_recording as read_recording
+    from sysid import *  # noqa: F403  # the names of the library
 
-_OTHER_MODULES = {
-    **dict.fromkeys(
-        (
-            *("AsyncClient", "Client", "ClientError"),
-            *("NotFinite", "ProblemError", "ServerUnreachable", "WaitTimeout"),
-        ),
-        "service.client",
-    ),
-    "read_recording": "service.formats.recordings",
-}
-"""Modules of the names that are not those of `sysid`."""
+from sysid.core.lazy_names import put_off_imports  # noqa: E402  # `sysid` is that of lagid
 
-__getattr__ = load_on_first_use(
-    __name__, {name: _OTHER_MODULES.get(name, "sysid") for name in __all__}
-)
+put_off_imports(globals())

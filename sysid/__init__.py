@@ -6,125 +6,46 @@ neither the compiler nor SciPy, so web process, command line and upload reader s
 
 from typing import TYPE_CHECKING
 
-from sysid.core.lazy_names import load_on_first_use
-
-if TYPE_CHECKING:
-    from sysid.core.errors import (
-        DivergedEverywhere,
-        InvalidModel,
-        InvalidRecord,
-        InvalidSettings,
-        MissingLibrary,
-        NothingIdentifiable,
-        RecordTooShort,
-        SysidError,
-        UnknownModel,
-        UnknownParameter,
-        UnreadableFile,
-        UnreadableResult,
-        UnwritableFile,
-    )
-    from sysid.core.settings import (
-        GeneticAlgorithm,
-        IslandChange,
-        Loss,
-        Migration,
-        SequenceSearch,
-        Stop,
-    )
-    from sysid.data.noise import Noise
-    from sysid.data.records import Channel, History, Record, Recording
-    from sysid.data.table_rules import ReadingNote
-    from sysid.export.export import export_model
-    from sysid.export.load import load_identified
-    from sysid.identification.identify import identify
-    from sysid.models.catalogue.load import catalogue, load_model
-    from sysid.models.parameters import Parameter
-    from sysid.results.result import Identification
-    from sysid.simulation.problem import Problem
-    from sysid.simulation.simulate import simulate
-    from sysid.uncertainty.estimates import Estimate
-
-__all__ = [
-    "Channel",
-    "DivergedEverywhere",
-    "Estimate",
-    "GeneticAlgorithm",
-    "History",
-    "Identification",
-    "InvalidModel",
-    "InvalidRecord",
-    "InvalidSettings",
-    "IslandChange",
-    "Loss",
-    "Migration",
-    "MissingLibrary",
-    "Noise",
-    "NothingIdentifiable",
-    "Parameter",
-    "Problem",
-    "ReadingNote",
-    "Record",
-    "RecordTooShort",
-    "Recording",
-    "SequenceSearch",
-    "Stop",
-    "SysidError",
-    "UnknownModel",
-    "UnknownParameter",
-    "UnreadableFile",
-    "UnreadableResult",
-    "UnwritableFile",
-    "catalogue",
-    "export_model",
-    "identify",
-    "load_identified",
-    "load_model",
-    "simulate",
-]
+from sysid.core.lazy_names import put_off_imports
 
 DISTRIBUTION = "lagid"
 """Tells this package from others of the name; `lagid` looks at it."""
 
-_PUBLIC_NAMES = {
-    "core.errors": (
-        "DivergedEverywhere",
-        "InvalidModel",
-        "InvalidRecord",
-        "InvalidSettings",
-        "MissingLibrary",
-        "NothingIdentifiable",
-        "RecordTooShort",
-        "SysidError",
-        "UnknownModel",
-        "UnknownParameter",
-        "UnreadableFile",
-        "UnreadableResult",
-        "UnwritableFile",
-    ),
-    "core.settings": (
-        "GeneticAlgorithm",
-        "IslandChange",
-        "Loss",
-        "Migration",
-        "SequenceSearch",
-        "Stop",
-    ),
-    "data.noise": ("Noise",),
-    "data.records": ("Channel", "History", "Record", "Recording"),
-    "data.table_rules": ("ReadingNote",),
-    "export.export": ("export_model",),
-    "export.load": ("load_identified",),
-    "identification.identify": ("identify",),
-    "results.result": ("Identification",),
-    "models.catalogue.load": ("catalogue", "load_model"),
-    "models.parameters": ("Parameter",),
-    "simulation.problem": ("Problem",),
-    "simulation.simulate": ("simulate",),
-    "uncertainty.estimates": ("Estimate",),
-}
-_MODULE_BY_NAME = {
-    name: f"{__name__}.{module}" for module, names in _PUBLIC_NAMES.items() for name in names
-}
+if TYPE_CHECKING:
+    from sysid.core.errors import DivergedEverywhere as DivergedEverywhere
+    from sysid.core.errors import InvalidModel as InvalidModel
+    from sysid.core.errors import InvalidRecord as InvalidRecord
+    from sysid.core.errors import InvalidSettings as InvalidSettings
+    from sysid.core.errors import MissingLibrary as MissingLibrary
+    from sysid.core.errors import NothingIdentifiable as NothingIdentifiable
+    from sysid.core.errors import RecordTooShort as RecordTooShort
+    from sysid.core.errors import SysidError as SysidError
+    from sysid.core.errors import UnknownModel as UnknownModel
+    from sysid.core.errors import UnknownParameter as UnknownParameter
+    from sysid.core.errors import UnreadableFile as UnreadableFile
+    from sysid.core.errors import UnreadableResult as UnreadableResult
+    from sysid.core.errors import UnwritableFile as UnwritableFile
+    from sysid.core.settings import GeneticAlgorithm as GeneticAlgorithm
+    from sysid.core.settings import IslandChange as IslandChange
+    from sysid.core.settings import Loss as Loss
+    from sysid.core.settings import Migration as Migration
+    from sysid.core.settings import SequenceSearch as SequenceSearch
+    from sysid.core.settings import Stop as Stop
+    from sysid.data.noise import Noise as Noise
+    from sysid.data.records import Channel as Channel
+    from sysid.data.records import History as History
+    from sysid.data.records import Record as Record
+    from sysid.data.records import Recording as Recording
+    from sysid.data.table_rules import ReadingNote as ReadingNote
+    from sysid.export.export import export_model as export_model
+    from sysid.export.load import load_identified as load_identified
+    from sysid.identification.identify import identify as identify
+    from sysid.models.catalogue.load import catalogue as catalogue
+    from sysid.models.catalogue.load import load_model as load_model
+    from sysid.models.parameters import Parameter as Parameter
+    from sysid.results.result import Identification as Identification
+    from sysid.simulation.problem import Problem as Problem
+    from sysid.simulation.simulate import simulate as simulate
+    from sysid.uncertainty.estimates import Estimate as Estimate
 
-__getattr__ = load_on_first_use(__name__, _MODULE_BY_NAME)
+put_off_imports(globals())

@@ -18,15 +18,13 @@ from service.api.openapi import list_operations
 Schema = Mapping[str, Any]
 
 DOCUMENT_FILE = Path("docs/openapi.json")
-TYPES_FILE = Path("service/client/documents.py")
+TYPES_FILE = Path("service/client/documents.pyi")
 _HEAD = '''"""Types of the answers of the REST interface, written by `make openapi`. Do not edit.
 
 They are dictionaries with the field names of the interface, for type checkers and editors.
 """
 
 # ruff: noqa: E501
-
-from __future__ import annotations
 
 from typing import Any, Literal, NotRequired, TypedDict
 '''
@@ -78,7 +76,7 @@ def _find_references(value: Any) -> Iterator[str]:
 
 def _write_class(name: str, schema: Schema) -> str:
     about = schema.get("description", name).split("\n\n")[0].replace("\n", " ")
-    lines = [f"\n\nclass {_name_type(name)}(TypedDict):", f'    """{about}"""', ""]
+    lines = [f"\nclass {_name_type(name)}(TypedDict):", f'    """{about}"""', ""]
     for field, kind in schema["properties"].items():
         text = _write_type(kind)
         is_required = field in schema.get("required", ())

@@ -1,26 +1,22 @@
 """The asynchronous client of the service; the counterpart of `Client`."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import aclosing
+from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import httpx
 
-from service.client import calls
-from service.client.calls import Answer, Document, RestCall, ServerUnreachable
-from service.client.progress import show_progress
-from service.client.rows import Rows
-
-if TYPE_CHECKING:
-    from service.client import documents
+from service.client import calls, operations
+from service.client.calls import RestCall
+from service.client.methods import Awaited, iterate
+from service.client.operations import Operations
 
 BLOCK_BYTES = 1 << 20
 """Size of the blocks in which a file is read."""
 
 
-class AsyncClient:
+class AsyncClient(Awaited, Operations):
     """Asynchronous client of the service; its methods are those of `Client`, with ``await``.
 
     Parameters and errors are those of `Client`. `runs` and `events` are iterated with ``async
@@ -36,13 +32,10 @@ class AsyncClient:
         retries: int = calls.DEFAULT_RETRIES,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
-        self.url, self._retries = calls.choose_url(url), retries
-        self._has_answered = False
+        super().__init__(url, retries)
+        headers = calls.make_auth_header(calls.choose_key(key))
         self._http = httpx.AsyncClient(
-            base_url=self.url,
-            headers=calls.make_auth_header(calls.choose_key(key)),
-            timeout=timeout,
-            transport=transport,
+            base_url=self.url, headers=headers, timeout=timeout, transport=transport
         )
 
     async def __aenter__(self) -> Self:
@@ -55,28 +48,8 @@ class AsyncClient:
         """Close the connections."""
         await self._http.aclose()
 
-    async def send(self, call: RestCall[Any], *, stream: bool = False) -> httpx.Response:
-        """Send one call and raise its errors. The caller reads and closes a stream."""
-        pauses = calls.plan_pauses(call, self._retries)
-        while True:
-            try:
-                response = await self._send_once(call, stream)
-            except httpx.TransportError as error:
-                pause = next(pauses, None) if self._is_lost(error) else None
-                if pause is None:
-                    raise ServerUnreachable(self.url, error) from error
-            else:
-                self._has_answered = True
-                pause = calls.choose_pause(response, pauses)
-                if pause is None:
-                    return calls.raise_for_problem(response)
-            await asyncio.sleep(pause)
-
-    def _is_lost(self, error: httpx.TransportError) -> bool:
-        """Whether a connection broke, or a server that had answered before is away."""
-        if isinstance(error, httpx.ConnectError):
-            return self._has_answered
-        return not isinstance(error, httpx.TimeoutException)
+    runs = iterate(operations.runs)
+    """All runs of a job, or the first `at_most` that pass the filters, one after the other."""
 
     async def _send_once(self, call: RestCall[Any], stream: bool) -> httpx.Response:
         content = _read_blocks(call.content) if isinstance(call.content, Path) else call.content
@@ -86,433 +59,17 @@ class AsyncClient:
             await response.aread()
         return response
 
-    async def _fetch(self, call: RestCall[Answer]) -> Answer:
-        document: Answer = (await self.send(call)).json()
-        return document
+    async def _pause(self, seconds: float) -> None:
+        await asyncio.sleep(seconds)
 
-    async def _iterate(
-        self, call: RestCall[Answer], at_most: int | None = None
-    ) -> AsyncIterator[Answer]:
-        pages = calls.Paginator(call, at_most)
-        while (page := pages.next_call()) is not None:
-            for item in pages.take_items(await self._fetch(page)):
-                yield item
+    def _read_pieces(self, response: httpx.Response) -> AsyncIterator[bytes]:
+        return response.aiter_bytes()
 
-    async def _fetch_list(self, call: RestCall[Answer], at_most: int | None = None) -> Rows[Answer]:
-        return Rows([item async for item in self._iterate(call, at_most)])
+    def _read_lines(self, response: httpx.Response) -> AsyncIterator[str]:
+        return response.aiter_lines()
 
-    async def _download(self, call: RestCall[bytes]) -> AsyncIterator[bytes]:
-        stream = await self.send(call, stream=True)
-        async with aclosing(stream):
-            try:
-                async for piece in stream.aiter_bytes():
-                    yield piece
-            except httpx.TransportError as error:
-                raise ServerUnreachable(self.url, error) from error
-
-    # ---- the server
-    async def health(self) -> "documents.HealthDocument":
-        """Check that the web process answers."""
-        return await self._fetch(calls.HEALTH())
-
-    async def readiness(self) -> "documents.ReadyDocument":
-        """Check database, store and dispatcher; `ProblemError` says which of them is away."""
-        return await self._fetch(calls.READINESS())
-
-    async def metrics(self) -> str:
-        """Fetch the gauges in Prometheus' text format."""
-        return (await self.send(calls.METRICS())).text
-
-    # ---- datasets
-    async def add_dataset(
-        self,
-        source: str | Path | bytes,
-        name: str | None = None,
-        *,
-        segments: str | None = None,
-        sample_time: float | None = None,
-    ) -> "documents.DatasetDocument":
-        """Store a recording from a file of any kind that is read, or from its bytes."""
-        return await self._fetch(calls.build_upload(source, name, segments, sample_time))
-
-    async def simulate_dataset(self, body: Mapping[str, Any]) -> "documents.DatasetDocument":
-        """Make a dataset from a model, its true parameters, inputs and noise."""
-        return await self._fetch(calls.SIMULATE_DATASET(json=body))
-
-    async def derive(
-        self, dataset: str, steps: list[Document], name: str | None = None
-    ) -> "documents.DatasetDocument":
-        """Make a dataset from another: noise, resample, trim, select, pool, and so on."""
-        body = {"name": name, "steps": steps}
-        return await self._fetch(calls.DERIVE(dataset, json=body))
-
-    async def datasets(
-        self, limit: int | None = None, **filters: Any
-    ) -> "Rows[documents.DatasetDocument]":
-        """List datasets, newest first: all, or at most `limit`; `name`, `tag` … are filters."""
-        return await self._fetch_list(calls.DATASETS(**filters), limit)
-
-    def iterate_datasets(self, **filters: Any) -> AsyncIterator["documents.DatasetDocument"]:
-        """Iterate over the datasets that pass the filters, latest first, a page at a time."""
-        return self._iterate(calls.DATASETS(**filters))
-
-    async def dataset(self, name: str) -> "documents.DatasetDocument":
-        """Fetch one dataset by its id."""
-        return await self._fetch(calls.DATASET(name))
-
-    async def signals(self, dataset: str, max_points: int = 1000) -> "documents.SignalsDocument":
-        """Fetch the signals of a dataset, reduced to at most `max_points` points per channel."""
-        return await self._fetch(calls.SIGNALS(dataset, max_points=max_points))
-
-    async def lineage(self, dataset: str) -> "documents.LineageDocument":
-        """Fetch the lineage of a dataset: its sources, and everything made from it."""
-        return await self._fetch(calls.LINEAGE(dataset))
-
-    async def content(self, dataset: str) -> bytes:
-        """Download a dataset as an MCAP file."""
-        return (await self.send(calls.CONTENT(dataset))).content
-
-    def download(self, dataset: str, format: str = "mcap") -> AsyncIterator[bytes]:
-        """Download a dataset piece by piece: mcap or csv."""
-        return self._download(calls.build_download(dataset, format))
-
-    async def dataset_figure(self, dataset: str, **options: Any) -> "documents.FigureDocument":
-        """Draw the signals of a dataset, as Plotly JSON; `options` are those of the interface."""
-        return await self._fetch(calls.DATASET_FIGURE(dataset, **options))
-
-    async def edit_dataset(
-        self, dataset: str, changes: Mapping[str, Any], *, if_match: str | None = None
-    ) -> "documents.DatasetDocument":
-        """Change name, note or tags of a dataset; `if_match` is the ETag that was read."""
-        return await self._fetch(calls.build_edit(calls.EDIT_DATASET, dataset, changes, if_match))
-
-    async def delete_dataset(
-        self, dataset: str, *, cascade: bool = False
-    ) -> "documents.DeletedDocument":
-        """Delete a dataset; `cascade` adds what was made from it."""
-        return await self._fetch(calls.build_deletion(calls.DELETE_DATASET, dataset, cascade))
-
-    # ---- access
-    async def access(self) -> "documents.AccessDocument":
-        """Fetch who asks: project and scopes, with the project's limits and use."""
-        return await self._fetch(calls.ACCESS())
-
-    async def audit(self, limit: int | None = None) -> "Rows[documents.AuditEntryDocument]":
-        """List who did what in the project, latest first: all, or at most `limit`."""
-        return await self._fetch_list(calls.AUDIT(), limit)
-
-    def iterate_audit(self) -> AsyncIterator["documents.AuditEntryDocument"]:
-        """Iterate over who did what in the project, latest first, a page at a time."""
-        return self._iterate(calls.AUDIT())
-
-    # ---- models
-    async def models(
-        self, limit: int | None = None, **filters: Any
-    ) -> "Rows[documents.ModelDocument]":
-        """List the built-in models and those of users: all, or at most `limit`."""
-        return await self._fetch_list(calls.MODELS(**filters), limit)
-
-    def iterate_models(self, **filters: Any) -> AsyncIterator["documents.ModelDocument"]:
-        """Iterate over the models that pass the filters, a page at a time."""
-        return self._iterate(calls.MODELS(**filters))
-
-    async def model(self, name: str) -> "documents.ModelDocument":
-        """Fetch one model with its document."""
-        return await self._fetch(calls.MODEL(name))
-
-    async def add_model(self, document: Mapping[str, Any]) -> "documents.ModelDocument":
-        """Store a user model; a changed document becomes its next version."""
-        return await self._fetch(calls.ADD_MODEL(json=document))
-
-    async def check_model(self, document: Mapping[str, Any]) -> "documents.CheckDocument":
-        """Check a model document; every error has its column."""
-        return await self._fetch(calls.CHECK_MODEL(json=document))
-
-    async def edit_model(
-        self, model: str, changes: Mapping[str, Any], *, if_match: str | None = None
-    ) -> "documents.ModelDocument":
-        """Change note or tags of a model; `if_match` is the ETag that was read."""
-        return await self._fetch(calls.build_edit(calls.EDIT_MODEL, model, changes, if_match))
-
-    async def delete_model(
-        self, model: str, *, cascade: bool = False
-    ) -> "documents.DeletedDocument":
-        """Delete a model, all versions or ``name@version``; `cascade` adds what used it."""
-        return await self._fetch(calls.build_deletion(calls.DELETE_MODEL, model, cascade))
-
-    # ---- jobs
-    async def submit(
-        self, job: Mapping[str, Any], *, idempotency_key: str | None = None
-    ) -> "documents.JobDocument":
-        """Queue a job."""
-        return await self._fetch(calls.build_submission(calls.SUBMIT, job, idempotency_key))
-
-    async def noise_sweep(
-        self, body: Mapping[str, Any], *, idempotency_key: str | None = None
-    ) -> "documents.JobDocument":
-        """Queue a noise sweep: σ × replicates × methods as one job."""
-        return await self._fetch(calls.build_submission(calls.NOISE_SWEEP, body, idempotency_key))
-
-    async def reidentify(
-        self, body: Mapping[str, Any], *, idempotency_key: str | None = None
-    ) -> "documents.JobDocument":
-        """Queue a batch re-identification: a run for each value of a label, with a trend."""
-        return await self._fetch(calls.build_submission(calls.REIDENTIFY, body, idempotency_key))
-
-    async def jobs(
-        self, limit: int | None = None, state: Sequence[str] | None = None, **filters: Any
-    ) -> "Rows[documents.JobDocument]":
-        """List jobs, newest first: all, at most `limit`, or those that filters select."""
-        return await self._fetch_list(calls.JOBS(state=state, **filters), limit)
-
-    def iterate_jobs(
-        self, state: Sequence[str] | None = None, **filters: Any
-    ) -> AsyncIterator["documents.JobDocument"]:
-        """Iterate over the jobs that pass the filters, latest first, a page at a time."""
-        return self._iterate(calls.JOBS(state=state, **filters))
-
-    async def job(self, name: str) -> "documents.JobDocument":
-        """Fetch one job with its state and progress."""
-        return await self._fetch(calls.JOB(name))
-
-    async def edit_job(
-        self, job: str, changes: Mapping[str, Any], *, if_match: str | None = None
-    ) -> "documents.JobDocument":
-        """Change name, note or tags of a job; `if_match` is the ETag that was read."""
-        return await self._fetch(calls.build_edit(calls.EDIT_JOB, job, changes, if_match))
-
-    async def delete_job(self, job: str, *, cascade: bool = False) -> "documents.DeletedDocument":
-        """Delete a job that has ended; `cascade` adds what was made from it."""
-        return await self._fetch(calls.build_deletion(calls.DELETE_JOB, job, cascade))
-
-    async def cancel(self, job: str) -> "documents.JobDocument":
-        """Cancel a job; its results so far stay."""
-        return await self._fetch(calls.CANCEL(job))
-
-    async def resume(self, job: str) -> "documents.JobDocument":
-        """Queue a failed or cancelled job again, from where it stopped."""
-        return await self._fetch(calls.RESUME(job))
-
-    async def clone(self, job: str) -> "documents.JobDocument":
-        """Queue the same request as a new job."""
-        return await self._fetch(calls.CLONE(job))
-
-    async def report(self, job: str) -> str:
-        """Fetch the report of a job, as HTML."""
-        return (await self.send(calls.REPORT(job))).text
-
-    async def wait(
-        self,
-        job: str,
-        progress: Callable[["documents.JobDocument"], object] | None = None,
-        *,
-        poll: float = calls.POLL_SECONDS,
-        timeout: float | None = None,
-        bar: bool = False,
-    ) -> "documents.JobDocument":
-        """Wait until a job has ended; `progress` is called with its state at every poll.
-
-        Parameters
-        ----------
-        poll : float
-            Time between two polls, s.
-        timeout : float, optional
-            Longest time to wait, s; by default without limit.
-        bar : bool
-            Whether a progress bar is shown on stderr.
-
-        Raises
-        ------
-        WaitTimeout
-            If the job has not ended in time.
-        """
-        limit = calls.WaitLimit(timeout)
-        with show_progress(job, is_shown=bar) as advance:
-            while True:
-                state = await self.job(job)
-                advance(state)
-                if progress is not None:
-                    progress(state)
-                if state["state"] in calls.TERMINAL_STATES:
-                    return state
-                await asyncio.sleep(limit.shorten(poll, state))
-
-    async def events(self, job: str, after: str | None = None) -> AsyncIterator[Document]:
-        """Yield the events of a job until its end; `after` is the id of the last event received.
-
-        After a lost connection, or 45 s without a sign of life, the stream is opened again. It
-        continues with the next event.
-
-        Raises
-        ------
-        ServerUnreachable
-            If the server stays silent, or too many streams break in succession.
-        """
-        events = calls.EventParser(after, self._retries)
-        while not events.is_over:
-            call = calls.build_event_stream(job, events.last)
-            stream = await self.send(call, stream=True)
-            async with aclosing(stream):
-                try:
-                    async for line in stream.aiter_lines():
-                        for event in events.feed_line(line):
-                            yield event
-                except httpx.TransportError as error:
-                    events.check_loss(ServerUnreachable(self.url, error))
-            if events.note_close(stream.status_code):
-                await asyncio.sleep(calls.FIRST_PAUSE_SECONDS)
-
-    # ---- runs
-    def runs(
-        self, job: str, *, at_most: int | None = None, **filters: Any
-    ) -> AsyncIterator["documents.RunDocument"]:
-        """List all runs of a job, or the first `at_most` that pass the filters."""
-        return self._iterate(calls.RUNS(job, **filters), at_most)
-
-    def iterate_runs(self, job: str, **filters: Any) -> AsyncIterator["documents.RunDocument"]:
-        """Iterate over the runs of a job that pass the filters, a page at a time."""
-        return self._iterate(calls.RUNS(job, **filters))
-
-    async def summary(
-        self, job: str, by: Sequence[str] | None = None
-    ) -> "documents.SummaryDocument":
-        """Fetch quantiles over the values of axes or labels, by default over all axes but seeds."""
-        return await self._fetch(calls.SUMMARY(job, by=by))
-
-    async def trend(self, job: str, outliers: str | None = None) -> "documents.TrendDocument":
-        """Fetch the trend of a batch over its label: law, band, predictions, outliers, drift.
-
-        Its laws leave outliers out, or count them with ``outliers="include"``.
-        """
-        return await self._fetch(calls.TREND(job, outliers=outliers))
-
-    async def summary_figure(self, job: str, **options: Any) -> "documents.FigureDocument":
-        """Draw errors against the noise, as Plotly JSON; `options` are those of the interface."""
-        return await self._fetch(calls.SUMMARY_FIGURE(job, **options))
-
-    async def trend_figure(self, job: str, **options: Any) -> "documents.FigureDocument":
-        """Draw the estimates over the label, as Plotly JSON."""
-        return await self._fetch(calls.TREND_FIGURE(job, **options))
-
-    def download_runs(self, job: str) -> AsyncIterator[bytes]:
-        """Download the table of all runs of a job as CSV, piece by piece."""
-        return self._download(calls.RUNS_CSV(job))
-
-    def download_estimates(self, run: str) -> AsyncIterator[bytes]:
-        """Download the estimates of a run as CSV, one parameter per row."""
-        return self._download(calls.ESTIMATES_CSV(run))
-
-    async def run(self, name: str) -> "documents.RunDocument":
-        """Fetch the result of one run."""
-        return await self._fetch(calls.RUN(name))
-
-    async def edit_run(
-        self, run: str, changes: Mapping[str, Any], *, if_match: str | None = None
-    ) -> "documents.RunDocument":
-        """Change note or tags of a run; `if_match` is the ETag that was read."""
-        return await self._fetch(calls.build_edit(calls.EDIT_RUN, run, changes, if_match))
-
-    async def delete_run(self, run: str, *, cascade: bool = False) -> "documents.DeletedDocument":
-        """Delete a run of a job that has ended; `cascade` adds what was made from it."""
-        return await self._fetch(calls.build_deletion(calls.DELETE_RUN, run, cascade))
-
-    async def history(self, run: str) -> "documents.HistoryDocument":
-        """Fetch the improvements of each island's champion."""
-        return await self._fetch(calls.HISTORY(run))
-
-    async def response(self, run: str, max_points: int = 1000) -> "documents.ResponseDocument":
-        """Fetch the measured and simulated outputs."""
-        return await self._fetch(calls.RESPONSE(run, max_points=max_points))
-
-    async def bands(self, run: str, max_points: int = 1000) -> "documents.BandsDocument":
-        """Fetch the 95 % confidence and prediction bands of the outputs."""
-        return await self._fetch(calls.BANDS(run, max_points=max_points))
-
-    async def simulate_run(
-        self, run: str, body: Mapping[str, Any], max_points: int = 1000
-    ) -> "documents.RunSimulationDocument":
-        """Simulate the identified model on a new input or under P, PI or PID control."""
-        return await self._fetch(calls.SIMULATE_RUN(run, json=body, max_points=max_points))
-
-    async def validate_run(
-        self,
-        run: str,
-        dataset: str,
-        channels: Mapping[str, str] | None = None,
-        *,
-        skip: int = 0,
-        max_points: int = 1000,
-    ) -> "documents.FreeRunDocument":
-        """Simulate the identified model on another recording: RMS and fit."""
-        body = {"dataset": dataset, "channels": dict(channels or {}), "skip": skip}
-        return await self._fetch(calls.VALIDATE_RUN(run, json=body, max_points=max_points))
-
-    async def migrations(self, run: str) -> "documents.MigrationsDocument":
-        """Fetch the migration log."""
-        return await self._fetch(calls.MIGRATIONS(run))
-
-    async def profile(
-        self, run: str, *parameters: str, points: int = 21
-    ) -> "documents.ProfilesDocument":
-        """Compute the profile likelihood of some free parameters; of all if none is named."""
-        body = {"parameters": parameters or None, "points": points}
-        return await self._fetch(calls.PROFILE(run, json=body))
-
-    async def residuals(self, run: str) -> "documents.ResidualsDocument":
-        """Fetch the correlation functions of the residuals, their bands and tests."""
-        return await self._fetch(calls.RESIDUALS(run))
-
-    async def run_figure(self, run: str, name: str, **options: Any) -> "documents.FigureDocument":
-        """Draw a figure of a run, such as ``response`` or ``history``, as Plotly JSON."""
-        return await self._fetch(calls.RUN_FIGURE(run, name, **options))
-
-    def download_signals(self, run: str) -> AsyncIterator[bytes]:
-        """Download the fitted signals of a run as MCAP, piece by piece."""
-        return self._download(calls.RUN_SIGNALS(run))
-
-    async def export(self, run: str, format: str = "json", pade_order: int = 3) -> str:
-        """Export the identified model as text: json, python, c or control."""
-        return (await self.send(calls.EXPORT(run, format=format, pade_order=pade_order))).text
-
-    async def compare(self, *runs: str) -> "documents.ComparisonDocument":
-        """Compare runs on the same data, best first."""
-        return await self._fetch(calls.COMPARE(json={"runs": runs}))
-
-    # ---- references
-    async def references(
-        self, limit: int | None = None, **filters: Any
-    ) -> "Rows[documents.ReferenceDocument]":
-        """List the references in use, by name: all, or at most `limit`."""
-        return await self._fetch_list(calls.REFERENCES(**filters), limit)
-
-    def iterate_references(self, **filters: Any) -> AsyncIterator["documents.ReferenceDocument"]:
-        """Iterate over the references that pass the filters, by name, a page at a time."""
-        return self._iterate(calls.REFERENCES(**filters))
-
-    async def reference(self, name: str) -> "documents.ReferenceDocument":
-        """Fetch one reference with its history."""
-        return await self._fetch(calls.REFERENCE(name))
-
-    async def accept_reference(
-        self, name: str, run: str, *, by: str | None = None, note: str | None = None
-    ) -> "documents.ReferenceDocument":
-        """Make a run the reference of a name; the previous one stays in the history."""
-        body = {"run": run, "by": by, "note": note}
-        return await self._fetch(calls.ACCEPT_REFERENCE(name, json=body))
-
-    async def edit_reference(
-        self, reference: str, changes: Mapping[str, Any], *, if_match: str | None = None
-    ) -> "documents.ReferenceDocument":
-        """Change name, note or tags of a reference; `if_match` is the ETag that was read."""
-        return await self._fetch(
-            calls.build_edit(calls.EDIT_REFERENCE, reference, changes, if_match)
-        )
-
-    async def delete_reference(
-        self, reference: str, *, cascade: bool = False
-    ) -> "documents.DeletedDocument":
-        """Delete a reference with its history; `cascade` adds what was made from it."""
-        return await self._fetch(calls.build_deletion(calls.DELETE_REFERENCE, reference, cascade))
+    async def _end_stream(self, response: httpx.Response) -> None:
+        await response.aclose()
 
 
 async def _read_blocks(path: Path) -> AsyncIterator[bytes]:

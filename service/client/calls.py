@@ -1,11 +1,10 @@
 """The calls of the REST interface as values, shared by both clients; loads no HTTP library.
 
-It also holds the errors of the clients, the pages of a list, the events of a job, and the retries.
+It also holds the errors of the clients, the events of a job, and when a call is sent again.
 """
 
 import json
 import os
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
 
 Document: TypeAlias = dict[str, Any]
 Answer = TypeVar("Answer")
-"""What a call is answered with; the items, if it is a list."""
+"""What a call is answered with; an item, if it is a list."""
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 URL_VARIABLE = "LAGID_URL"
@@ -41,7 +40,6 @@ POLL_SECONDS = 0.3
 TIMEOUT_SECONDS = 60.0
 EVENT_TIMEOUT_SECONDS = 45.0
 """Three times the pause between two signs of life of an event stream."""
-PAGE_SIZE = 500
 
 
 def choose_url(url: str | None) -> str:
@@ -138,9 +136,10 @@ class NotFinite(ClientError):
 
 @dataclass(frozen=True, slots=True)
 class RestCall(Generic[Answer]):
-    """One request, not yet sent, and the type of its answer.
+    """One request, not yet sent, and the type of its answer, or of an item of it if it is a list.
 
-    `timeout` is its own longest time without a byte, s; by default that of the client.
+    `timeout` is its own longest time without a byte, s; by default that of the client. `at_most` is
+    the number of items that are wanted of a list; by default all.
 
     Raises
     ------
@@ -155,6 +154,7 @@ class RestCall(Generic[Answer]):
     content: bytes | Path | None = None
     headers: Mapping[str, str] = field(default_factory=dict)
     timeout: float | None = None
+    at_most: int | None = None
 
     def __post_init__(self) -> None:
         _check_finite("", self.json)
@@ -164,6 +164,10 @@ class RestCall(Generic[Answer]):
         request = {"method": self.method, "url": self.path, "content": content, "json": self.json}
         limit = {} if self.timeout is None else {"timeout": self.timeout}
         return {**request, "params": dict(self.params), "headers": dict(self.headers), **limit}
+
+    def take(self, at_most: int | None) -> "RestCall[Answer]":
+        """Return the call of a list of which so many items are wanted."""
+        return replace(self, at_most=at_most)
 
 
 def _check_finite(pointer: str, value: Any) -> None:
@@ -178,27 +182,14 @@ def _check_finite(pointer: str, value: Any) -> None:
             _check_finite(f"{pointer}/{index}", item)
 
 
-@dataclass(frozen=True, slots=True)
-class Endpoint(Generic[Answer]):
-    """An endpoint: its method, and its path with ``{}`` for each name, and the type of its answer.
+def call(route: str, /, *names: str, json: Any = None, **params: Any) -> RestCall[Any]:
+    """Build the call of a route, such as ``GET /v1/jobs/{}``, for resources of these names.
 
-    A path without a slash at its begin lies below ``/v1/``. The type of a list is that of its
-    items.
+    Parameters of the query that are None are left out.
     """
-
-    method: str
-    path: str
-
-    @property
-    def full_path(self) -> str:
-        """The path from the address of the server on."""
-        return self.path if self.path.startswith("/") else f"/v1/{self.path}"
-
-    def __call__(self, *names: str, json: Any = None, **params: Any) -> RestCall[Answer]:
-        """Build the call for resources of these names; parameters that are None are left out."""
-        path = self.full_path.format(*(quote(name, safe="") for name in names))
-        query = {key: _to_query(value) for key, value in params.items() if value is not None}
-        return RestCall(self.method, path, query, json)
+    method, path = route.split()
+    query = {key: _to_query(value) for key, value in params.items() if value is not None}
+    return RestCall(method, path.format(*(quote(name, safe="") for name in names)), query, json)
 
 
 def _to_query(value: Any) -> Any:
@@ -206,150 +197,40 @@ def _to_query(value: Any) -> Any:
     return list(value) if is_list else value
 
 
-ADD_DATASET: "Endpoint[documents.DatasetDocument]" = Endpoint("POST", "datasets")
-SIMULATE_DATASET: "Endpoint[documents.DatasetDocument]" = Endpoint("POST", "datasets:simulate")
-DERIVE: "Endpoint[documents.DatasetDocument]" = Endpoint("POST", "datasets/{}:derive")
-DATASETS: "Endpoint[documents.DatasetDocument]" = Endpoint("GET", "datasets")
-DATASET: "Endpoint[documents.DatasetDocument]" = Endpoint("GET", "datasets/{}")
-SIGNALS: "Endpoint[documents.SignalsDocument]" = Endpoint("GET", "datasets/{}/signals")
-LINEAGE: "Endpoint[documents.LineageDocument]" = Endpoint("GET", "datasets/{}/lineage")
-CONTENT: Endpoint[bytes] = Endpoint("GET", "datasets/{}/content")
-CONTENT_CSV: Endpoint[bytes] = Endpoint("GET", "datasets/{}/content.csv")
-
-MODELS: "Endpoint[documents.ModelDocument]" = Endpoint("GET", "models")
-MODEL: "Endpoint[documents.ModelDocument]" = Endpoint("GET", "models/{}")
-ADD_MODEL: "Endpoint[documents.ModelDocument]" = Endpoint("POST", "models")
-CHECK_MODEL: "Endpoint[documents.CheckDocument]" = Endpoint("POST", "models:check")
-
-SUBMIT: "Endpoint[documents.JobDocument]" = Endpoint("POST", "jobs")
-NOISE_SWEEP: "Endpoint[documents.JobDocument]" = Endpoint("POST", "recipes/noise-sweep")
-REIDENTIFY: "Endpoint[documents.JobDocument]" = Endpoint("POST", "recipes/reidentify")
-JOBS: "Endpoint[documents.JobDocument]" = Endpoint("GET", "jobs")
-JOB: "Endpoint[documents.JobDocument]" = Endpoint("GET", "jobs/{}")
-CANCEL: "Endpoint[documents.JobDocument]" = Endpoint("POST", "jobs/{}:cancel")
-RESUME: "Endpoint[documents.JobDocument]" = Endpoint("POST", "jobs/{}:resume")
-CLONE: "Endpoint[documents.JobDocument]" = Endpoint("POST", "jobs/{}:clone")
-EVENTS: Endpoint[bytes] = Endpoint("GET", "jobs/{}/events")
-REPORT: Endpoint[bytes] = Endpoint("GET", "jobs/{}/report")
-RUNS: "Endpoint[documents.RunDocument]" = Endpoint("GET", "jobs/{}/runs")
-SUMMARY: "Endpoint[documents.SummaryDocument]" = Endpoint("GET", "jobs/{}/summary")
-TREND: "Endpoint[documents.TrendDocument]" = Endpoint("GET", "jobs/{}/trend")
-
-RUN: "Endpoint[documents.RunDocument]" = Endpoint("GET", "runs/{}")
-HISTORY: "Endpoint[documents.HistoryDocument]" = Endpoint("GET", "runs/{}/history")
-RESPONSE: "Endpoint[documents.ResponseDocument]" = Endpoint("GET", "runs/{}/response")
-BANDS: "Endpoint[documents.BandsDocument]" = Endpoint("GET", "runs/{}/bands")
-SIMULATE_RUN: "Endpoint[documents.RunSimulationDocument]" = Endpoint("POST", "runs/{}:simulate")
-VALIDATE_RUN: "Endpoint[documents.FreeRunDocument]" = Endpoint("POST", "runs/{}:validate")
-MIGRATIONS: "Endpoint[documents.MigrationsDocument]" = Endpoint("GET", "runs/{}/migrations")
-PROFILE: "Endpoint[documents.ProfilesDocument]" = Endpoint("POST", "runs/{}:profile")
-RESIDUALS: "Endpoint[documents.ResidualsDocument]" = Endpoint("GET", "runs/{}/residuals")
-EXPORT: Endpoint[bytes] = Endpoint("GET", "runs/{}/export")
-COMPARE: "Endpoint[documents.ComparisonDocument]" = Endpoint("POST", "runs:compare")
-
-RUNS_CSV: Endpoint[bytes] = Endpoint("GET", "jobs/{}/runs.csv")
-ESTIMATES_CSV: Endpoint[bytes] = Endpoint("GET", "runs/{}/estimates.csv")
-SUMMARY_FIGURE: "Endpoint[documents.FigureDocument]" = Endpoint("GET", "jobs/{}/figures/summary")
-TREND_FIGURE: "Endpoint[documents.FigureDocument]" = Endpoint("GET", "jobs/{}/figures/trend")
-RUN_SIGNALS: Endpoint[bytes] = Endpoint("GET", "runs/{}/signals.mcap")
-RUN_FIGURE: "Endpoint[documents.FigureDocument]" = Endpoint("GET", "runs/{}/figures/{}")
-DATASET_FIGURE: "Endpoint[documents.FigureDocument]" = Endpoint(
-    "GET", "datasets/{}/figures/signals"
-)
-
-HEALTH: "Endpoint[documents.HealthDocument]" = Endpoint("GET", "/healthz")
-READINESS: "Endpoint[documents.ReadyDocument]" = Endpoint("GET", "/readyz")
-METRICS: Endpoint[bytes] = Endpoint("GET", "/metrics")
-
-ACCESS: "Endpoint[documents.AccessDocument]" = Endpoint("GET", "access")
-AUDIT: "Endpoint[documents.AuditEntryDocument]" = Endpoint("GET", "audit")
-
-REFERENCES: "Endpoint[documents.ReferenceDocument]" = Endpoint("GET", "references")
-REFERENCE: "Endpoint[documents.ReferenceDocument]" = Endpoint("GET", "references/{}")
-ACCEPT_REFERENCE: "Endpoint[documents.ReferenceDocument]" = Endpoint("PUT", "references/{}")
-EDIT_DATASET: "Endpoint[documents.DatasetDocument]" = Endpoint("PATCH", "datasets/{}")
-DELETE_DATASET: "Endpoint[documents.DeletedDocument]" = Endpoint("DELETE", "datasets/{}")
-EDIT_MODEL: "Endpoint[documents.ModelDocument]" = Endpoint("PATCH", "models/{}")
-DELETE_MODEL: "Endpoint[documents.DeletedDocument]" = Endpoint("DELETE", "models/{}")
-EDIT_JOB: "Endpoint[documents.JobDocument]" = Endpoint("PATCH", "jobs/{}")
-DELETE_JOB: "Endpoint[documents.DeletedDocument]" = Endpoint("DELETE", "jobs/{}")
-EDIT_RUN: "Endpoint[documents.RunDocument]" = Endpoint("PATCH", "runs/{}")
-DELETE_RUN: "Endpoint[documents.DeletedDocument]" = Endpoint("DELETE", "runs/{}")
-EDIT_REFERENCE: "Endpoint[documents.ReferenceDocument]" = Endpoint("PATCH", "references/{}")
-DELETE_REFERENCE: "Endpoint[documents.DeletedDocument]" = Endpoint("DELETE", "references/{}")
-
-
 def build_edit(
-    endpoint: Endpoint[Answer], name: str, changes: Mapping[str, Any], if_match: str | None
-) -> RestCall[Answer]:
+    route: str, name: str, changes: Mapping[str, Any], if_match: str | None
+) -> RestCall[Any]:
     """Build a call that changes name, note or tags, by `if_match` only of that version."""
     headers = {} if if_match is None else {"If-Match": if_match}
-    return replace(endpoint(name, json=changes), headers=headers)
+    return replace(call(route, name, json=changes), headers=headers)
 
 
-def build_deletion(endpoint: Endpoint[Answer], name: str, cascade: bool) -> RestCall[Answer]:
-    """Build a call that deletes an item, by `cascade` with everything that was made from it."""
-    return endpoint(name, cascade=True) if cascade else endpoint(name)
-
-
-def build_submission(
-    endpoint: Endpoint[Answer], body: Mapping[str, Any], key: str | None
-) -> RestCall[Answer]:
+def build_submission(route: str, body: Mapping[str, Any], key: str | None) -> RestCall[Any]:
     """Build a call that queues a job; the same idempotency key again returns the same job.
 
     Without a key the call gets a random one, so that it can be repeated if no response came.
     """
-    return replace(endpoint(json=body), headers={IDEMPOTENCY_HEADER: key or uuid4().hex})
+    return replace(call(route, json=body), headers={IDEMPOTENCY_HEADER: key or uuid4().hex})
 
 
 def build_event_stream(job: str, after: str | None) -> RestCall[bytes]:
     """Build the call for a job's events, or for those after an event."""
     headers = {"Last-Event-ID": after} if after else {}
-    return replace(EVENTS(job), headers=headers, timeout=EVENT_TIMEOUT_SECONDS)
-
-
-def build_download(dataset: str, file_format: str) -> RestCall[bytes]:
-    """Build the call that downloads a dataset as ``mcap`` or ``csv``."""
-    return (CONTENT_CSV if file_format == "csv" else CONTENT)(dataset)
+    stream = call("GET /v1/jobs/{}/events", job)
+    return replace(stream, headers=headers, timeout=EVENT_TIMEOUT_SECONDS)
 
 
 def build_upload(
     source: str | Path | bytes, name: str | None, segments: str | None, sample_time: float | None
-) -> "RestCall[documents.DatasetDocument]":
+) -> RestCall[Any]:
     """Build the call that stores a file or bytes."""
     content = source if isinstance(source, bytes) else Path(source)
     kind = FILE_TYPE
     if isinstance(content, Path):
         kind = MCAP_TYPE if content.suffix.lower() == ".mcap" else FILE_TYPE
         name = name or content.name.removesuffix(".gz").rpartition(".")[0] or content.name
-    call = ADD_DATASET(name=name, segments=segments, sample_time=sample_time)
-    return replace(call, content=content, headers={"content-type": kind})
-
-
-class Paginator(Generic[Answer]):
-    """Reads a list page by page: `at_most` items, or all."""
-
-    def __init__(self, call: RestCall[Answer], at_most: int | None) -> None:
-        self._call, self._left, self._limit = call, at_most, min(at_most or PAGE_SIZE, PAGE_SIZE)
-        self._cursor: str | None = None
-        self._is_over = False
-
-    def next_call(self) -> RestCall[Any] | None:
-        """Return the call of the next page; None after the last page."""
-        if self._is_over:
-            return None
-        position = {"cursor": self._cursor} if self._cursor else {}
-        params = {**self._call.params, "limit": self._limit, **position}
-        return replace(self._call, params=params)
-
-    def take_items(self, page: Document) -> list[Answer]:
-        """Return the items of a page and remember its cursor."""
-        items: list[Answer] = page["items"][: self._left]
-        if self._left is not None:
-            self._left -= len(items)
-        self._cursor = page["next"]
-        self._is_over = self._cursor is None or self._left == 0
-        return items
+    upload = call("POST /v1/datasets", name=name, segments=segments, sample_time=sample_time)
+    return replace(upload, content=content, headers={"content-type": kind})
 
 
 def raise_for_problem(response: "httpx.Response") -> "httpx.Response":
@@ -373,47 +254,23 @@ def raise_for_problem(response: "httpx.Response") -> "httpx.Response":
 
 
 class EventParser:
-    """Parses server-sent events line by line, over one stream after the other.
+    """Parses the lines of a stream of server-sent events."""
 
-    Attributes
-    ----------
-    last : str or None
-        Id of the last event; the next stream begins after it.
-    is_over : bool
-        Whether there is no further event, or too many streams broke in succession.
-    """
-
-    def __init__(self, last: str | None, retries: int) -> None:
-        self.last, self.is_over = last, False
-        self._retries, self._losses = retries, 0
+    def __init__(self) -> None:
         self._fields: dict[str, str] = {}
 
-    def feed_line(self, line: str) -> Iterator[Document]:
-        """Take one line; yield the event that it completes, with its data decoded from JSON."""
+    def feed_line(self, line: str) -> Document | None:
+        """Take one line; return the event that it completes, with its data decoded from JSON."""
         if line:
             key, _, value = line.partition(":")
             if key:  # a line that begins with a colon is a comment that keeps the line open
                 self._fields[key] = value.removeprefix(" ")
-            return
+            return None
         fields, self._fields = self._fields, {}
-        if "data" in fields:
-            kind = fields.get("event", "message")
-            self.last, self._losses = fields.get("id"), 0
-            self.is_over = kind == "end"
-            yield {"id": self.last, "event": kind, "data": json.loads(fields["data"])}
-
-    def check_loss(self, error: ServerUnreachable) -> None:
-        """Raise the error of a broken stream if too many broke in succession."""
-        if self._losses >= self._retries:
-            raise error
-
-    def note_close(self, status: int) -> bool:
-        """Note the end of a stream; return whether another one may have further events."""
-        self._fields = {}
-        self._losses += 1
-        if status == HTTPStatus.NO_CONTENT or self._losses > self._retries:
-            self.is_over = True
-        return not self.is_over
+        if "data" not in fields:
+            return None
+        kind = fields.get("event", "message")
+        return {"id": fields.get("id"), "event": kind, "data": json.loads(fields["data"])}
 
 
 def _describe_fault(entry: Mapping[str, Any]) -> str:
@@ -459,28 +316,6 @@ def choose_pause(response: "httpx.Response", pauses: "Iterator[float]") -> float
     requested = _parse_retry_after(response.headers.get("Retry-After"))
     pause = pause if requested is None else requested
     return pause if pause <= MAX_PAUSE_SECONDS else None
-
-
-class WaitLimit:
-    """The time until which a job is waited for."""
-
-    def __init__(self, seconds: float | None) -> None:
-        self._seconds, self._start = seconds, time.monotonic()
-
-    def shorten(self, pause: float, job: "documents.JobDocument") -> float:
-        """Return a pause that ends in time.
-
-        Raises
-        ------
-        WaitTimeout
-            If no time is left.
-        """
-        if self._seconds is None:
-            return pause
-        left = self._start + self._seconds - time.monotonic()
-        if left <= 0:
-            raise WaitTimeout(job, self._seconds)
-        return min(pause, left)
 
 
 def _parse_retry_after(header: str | None) -> float | None:

@@ -1,35 +1,47 @@
 """Load on first use: public names of a package, and libraries that a user may not have."""
 
-import sys
-from collections.abc import Callable, Mapping
+import ast
+from collections.abc import Iterator
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 
-def load_on_first_use(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Make the function `__getattr__` of a package.
+def put_off_imports(package: dict[str, Any]) -> None:
+    """Import the public names of a package when they are used, each from its own module.
+
+    They are those of the block ``if TYPE_CHECKING:`` at the end of the package's file, so that type
+    checkers and editors read plain imports, and a name stands once. A star stands for the public
+    names of a package that does the same. The mechanism is that of SPEC 1 of Scientific Python.
 
     Parameters
     ----------
-    package : str
-    modules : mapping of str to str
-        Public name → module that defines it.
-
-    Examples
-    --------
-    >>> load_name = load_on_first_use("sysid.core", {"sqrt": "math"})
-    >>> load_name("sqrt")(9.0)
-    3.0
+    package : dict of str to Any
+        The ``globals()`` of the package. It is given ``__all__`` and ``__getattr__``.
     """
+    modules = dict(_list_imports(Path(package["__file__"]).read_text(encoding="utf-8")))
 
     def load_name(name: str) -> Any:
         if name not in modules:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(import_module(modules[name]), name)
-        setattr(sys.modules[package], name, value)  # the next use finds it there
-        return value
+            raise AttributeError(f"module {package['__name__']!r} has no attribute {name!r}")
+        package[name] = getattr(import_module(modules[name]), name)  # the next use finds it there
+        return package[name]
 
-    return load_name
+    package |= {"__all__": sorted(modules), "__getattr__": load_name}
+
+
+def _list_imports(source: str) -> Iterator[tuple[str, str]]:
+    """List the names that a file imports for type checkers, and the module of each."""
+    for block in ast.parse(source).body:
+        if not (isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"):
+            continue
+        for line in block.body:
+            assert isinstance(line, ast.ImportFrom)
+            assert line.module is not None
+            for alias in line.names:
+                star = alias.name == "*"
+                names = import_module(line.module).__all__ if star else [alias.name]
+                yield from ((name, line.module) for name in names)
 
 
 def load_library(name: str, call: str) -> Any:

@@ -211,7 +211,7 @@ def _draw_catalogue(folder: Path) -> None:
 def _describe_python() -> Iterator[str]:
     yield "# The Python library\n\n`import lagid` has all names of this page.\n"
     groups: dict[str, list[str]] = {"Functions": [], "Classes": [], "Errors": []}
-    for name in lagid.__all__:
+    for name in vars(lagid)["__all__"]:
         found = getattr(lagid, name)
         is_error = isinstance(found, type) and issubclass(found, BaseException)
         kind = "Errors" if is_error else "Classes" if isinstance(found, type) else "Functions"
@@ -223,7 +223,9 @@ def _describe_python() -> Iterator[str]:
         members = "   :members:\n" if title == "Classes" else ""
         yield f"\n## {title}\n"
         for name in names:
-            yield f"\n```{{eval-rst}}\n.. {directive}:: lagid.{name}\n{members}```\n"
+            inherited = "   :inherited-members:\n" if name.endswith("Client") else ""
+            options = members + inherited
+            yield f"\n```{{eval-rst}}\n.. {directive}:: lagid.{name}\n{options}```\n"
 
 
 def _describe_type(schema: Document) -> str:

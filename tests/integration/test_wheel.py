@@ -63,6 +63,7 @@ def test_the_wheel_holds_all_that_runs_and_no_tests(wheel: Path) -> None:
         "migrations/versions/*.py",
         "migrations/script.py.mako",
         "*/py.typed",
+        "service/client/*.pyi",
     ):
         files = {str(p.relative_to(ROOT)) for p in ROOT.glob(pattern) if p.is_file()}
         assert files
@@ -88,6 +89,67 @@ def test_the_wheel_names_its_version_licence_extras_and_command(wheel: Path) -> 
     classifiers = about.get_all("Classifier")
     assert {f"Programming Language :: Python :: {one}" for one in PYTHONS} <= {*classifiers}
     assert "lagid = lagid:main" in command
+
+
+TYPED = """
+from collections.abc import AsyncIterator, Iterator
+from typing import Any, assert_type
+
+from lagid import AsyncClient, Client, SysidError, load_model
+from service.client.documents import JobDocument, RunDocument
+from service.client.rows import Rows
+from sysid.models.model import Model
+
+assert_type(load_model("fopdt"), Model)
+assert_type(SysidError().args, tuple[Any, ...])
+
+
+def wait(client: Client) -> str:
+    assert_type(client.jobs(3, state=["failed"], tag="night"), Rows[JobDocument])
+    assert_type(client.runs("job_1", at_most=3), Rows[RunDocument])
+    assert_type(client.iterate_runs("job_1"), Iterator[RunDocument])
+    assert_type(client.events("job_1"), Iterator[dict[str, Any]])
+    assert_type(client.report("job_1"), str)
+    client.wait("job_1", bar="no")  # Argument "bar"
+    client.submit()  # Too few arguments
+    client.submitted({})  # has no attribute "submitted"
+    client.job(name="job_1")["stat"]  # "stat" is not a valid TypedDict key
+    return client.job(name="job_1")["state"]
+
+
+async def work(client: AsyncClient) -> JobDocument:
+    assert_type(await client.jobs(3, state=["failed"], tag="night"), Rows[JobDocument])
+    assert_type(client.runs("job_1", at_most=3), AsyncIterator[RunDocument])
+    assert_type(client.download("ds_1"), AsyncIterator[bytes])
+    return client.job("job_1")  # Incompatible return value type
+"""
+
+
+def test_a_type_checker_knows_an_installed_client(wheel: Path, tmp_path: Path) -> None:
+    """Each line with a comment has that error, and no other line has one."""
+    environment = tmp_path / "environment"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
+    (libraries,) = environment.glob("lib/*/site-packages")
+    with ZipFile(wheel) as archive:
+        archive.extractall(libraries)
+    (tmp_path / "typed.py").write_text(TYPED)
+    options = ("--strict", "--cache-dir", tmp_path / "cache", "--no-error-summary")
+    python = ("--python-executable", environment / "bin" / "python")
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", *options, *python, "typed.py"],
+        cwd=tmp_path,
+        env={"PATH": os.environ["PATH"]},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    faults = [line for line in done.stdout.splitlines() if ": error: " in line]
+    lines = enumerate(TYPED.splitlines(), 1)
+    wanted = [(number, line.split("  # ")[1]) for number, line in lines if "  # " in line]
+    assert len(faults) == len(wanted), done.stdout
+    for fault, (number, text) in zip(faults, wanted, strict=True):
+        assert fault.startswith(f"typed.py:{number}: error: ")
+        assert text in fault
 
 
 def find_python(version: str) -> Path:

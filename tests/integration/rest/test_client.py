@@ -7,9 +7,8 @@ import httpx
 import pytest
 from starlette.testclient import TestClient
 
-from service.client import calls
 from service.client.async_client import AsyncClient
-from service.client.calls import NotFinite, ProblemError, ServerUnreachable
+from service.client.calls import NotFinite, ProblemError, ServerUnreachable, call
 from service.client.client import Client
 from tests.rest import awaited, recording
 
@@ -115,7 +114,7 @@ def test_a_name_in_a_path_is_sent_as_it_is(client: Client, name: str) -> None:
     with pytest.raises(ProblemError) as refused:
         client.model(name)
     assert refused.value.status == 404
-    assert calls.MODEL(name).path.count("/") == 3
+    assert call("GET /v1/models/{}", name).path.count("/") == 3
 
 
 def test_a_server_that_is_not_there_is_said_with_what_to_do() -> None:
@@ -155,4 +154,4 @@ def test_a_number_that_json_cannot_tell_is_named_and_not_sent(
     with pytest.raises(NotFinite, match=r"^/parameters/L/upper: found -?(nan|inf); need a finite"):
         client.submit(job_of(dataset, parameters=bounds))
     with pytest.raises(NotFinite, match=r"^/0/noise/sigma: "):
-        calls.RestCall("POST", "/v1/x", json=[{"noise": {"sigma": value}}])
+        call("POST /v1/x", json=[{"noise": {"sigma": value}}])

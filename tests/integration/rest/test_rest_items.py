@@ -9,7 +9,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
-from service.client.calls import JOB, ProblemError
+from service.client.calls import ProblemError, call
 from service.client.client import Client
 from tests.commands import check_refusal, run_lagid
 from tests.identified import identified
@@ -209,7 +209,7 @@ def test_the_client_edits_finds_and_deletes(served: tuple[str, Client]) -> None:
     _, client = served
     data = client.add_dataset(recording(), "steps")["id"]
     job = client.submit({"model": "fopdt", "datasets": [data], "name": "mine"})["id"]
-    version = client.send(JOB(job)).headers["ETag"]
+    version = client.send(call("GET /v1/jobs/{}", job)).headers["ETag"]
     assert client.edit_job(job, {"tags": ["x"]}, if_match=version)["tags"] == ["x"]
     with pytest.raises(ProblemError) as stale:
         client.edit_job(job, {"tags": []}, if_match=version)

@@ -1,9 +1,11 @@
 """Methods of the clients: settings, waiting, lists, and one method for each route."""
 
+import asyncio
 import inspect
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import httpx
@@ -13,6 +15,7 @@ from service.api.write_contract import DOCUMENT_FILE
 from service.client.async_client import AsyncClient
 from service.client.calls import ClientError, WaitTimeout, choose_key
 from service.client.client import Client
+from service.client.methods import finish
 from service.client.rows import Rows
 from tests.repository import ROOT
 from tests.rest import awaited
@@ -32,23 +35,62 @@ def answer_anything(request: httpx.Request) -> httpx.Response:
     )
 
 
-def list_calls() -> set[tuple[str, str]]:
-    """Method and path of what all methods of the client send, with `x` for each name."""
-    sent: set[tuple[str, str]] = set()
+Sent = tuple[str, str, str, bytes]
 
-    def note(request: httpx.Request) -> httpx.Response:
-        sent.add((request.method, request.url.path))
+
+class Listener:
+    """Answers anything, and keeps what it was asked: method, path, query and body."""
+
+    def __init__(self) -> None:
+        self.sent: list[Sent] = []
+
+    def __call__(self, request: httpx.Request) -> httpx.Response:
+        url = request.url
+        self.sent.append((request.method, url.path, url.query.decode(), request.content))
         return answer_anything(request)
 
-    with Client("http://here", transport=httpx.MockTransport(note)) as client:
-        for name, method in inspect.getmembers(client, inspect.ismethod):
-            if name.startswith("_") or name in ("close", "send"):
-                continue
-            for given in ({}, {"format": "csv"} if name == "download" else {}):
-                result = method(*choose_arguments(method), **given)
-                if inspect.isgenerator(result):
-                    list(result)
-    return sent
+    def take(self) -> list[Sent]:
+        sent, self.sent = self.sent, []
+        return sent
+
+
+def list_methods(client: Client | AsyncClient) -> dict[str, Callable[..., Any]]:
+    """Public methods that ask the server for something; both forms of a download."""
+    named = inspect.getmembers(client, inspect.ismethod)
+    methods = {name: one for name, one in named if not name.startswith("_")}
+    assert {methods.pop(name).__name__ for name in ("close", "send")} == {"close", "send"}
+    methods["download as csv"] = partial(methods["download"], format="csv")
+    return methods
+
+
+def ask_all() -> dict[str, tuple[list[Sent], Any]]:
+    """What each method of the synchronous client sends, and its answer."""
+    listener = Listener()
+    exchanges = {}
+    with Client("http://here", transport=httpx.MockTransport(listener)) as client:
+        for name, method in list_methods(client).items():
+            answer = method(*choose_arguments(method))
+            answer = list(answer) if inspect.isgenerator(answer) else answer
+            exchanges[name] = (listener.take(), answer)
+    return exchanges
+
+
+def ask_all_awaited() -> dict[str, tuple[list[Sent], Any]]:
+    """What each method of the asynchronous client sends, and its answer."""
+    listener = Listener()
+
+    async def work() -> dict[str, tuple[list[Sent], Any]]:
+        exchanges = {}
+        transport = httpx.MockTransport(listener)
+        async with AsyncClient("http://here", transport=transport) as client:
+            for name, method in list_methods(client).items():
+                answer = method(*choose_arguments(method))
+                answer = await answer if inspect.isawaitable(answer) else [a async for a in answer]
+                exchanges[name] = (listener.take(), answer)
+        return exchanges
+
+    exchanges: dict[str, tuple[list[Sent], Any]] = awaited(work)
+    return exchanges
 
 
 def choose_arguments(method: Callable[..., Any]) -> list[Any]:
@@ -72,7 +114,26 @@ def test_every_route_has_a_method_and_every_method_a_route() -> None:
         for path, verbs in document["paths"].items()
         for verb in verbs
     }
-    assert list_calls() == routes
+    sent = [one for requests, _ in ask_all().values() for one in requests]
+    assert {(method, path) for method, path, _, _ in sent} == routes
+
+
+def test_an_operation_sends_the_same_and_answers_the_same_from_both_clients() -> None:
+    exchanges = ask_all()
+    assert all(len(sent) == 1 for sent, _ in exchanges.values())
+    assert exchanges == ask_all_awaited()
+
+
+def test_both_clients_show_what_an_operation_takes_and_gives() -> None:
+    for name in ("job", "jobs", "wait"):
+        waiting, twin = getattr(Client, name), getattr(AsyncClient, name)
+        assert inspect.signature(waiting) == inspect.signature(twin)
+        assert inspect.getdoc(waiting) == inspect.getdoc(twin) is not None
+        assert (waiting.__name__, inspect.iscoroutinefunction(twin)) == (name, True)
+    for name, answers in (("iterate_jobs", "Iterator"), ("events", "Iterator"), ("runs", "Rows")):
+        waiting, twin = getattr(Client, name), getattr(AsyncClient, name)
+        assert f".{answers}[" in str(inspect.signature(waiting).return_annotation)
+        assert ".AsyncIterator[" in str(inspect.signature(twin).return_annotation)
 
 
 def test_address_and_key_come_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,18 +237,50 @@ def test_a_list_of_runs_becomes_a_table() -> None:
     assert table.loc[0, "cell./seed"] == 1
 
 
-def test_a_download_is_given_piece_by_piece() -> None:
-    class Pieces(httpx.SyncByteStream):
-        read = 0
+class Pieces(httpx.SyncByteStream):
+    """Five pieces of a file; notes how many were read, and whether the stream was closed."""
 
-        def __iter__(self) -> Any:
-            for _ in range(5):
-                self.read += 1
-                yield b"0123456789"
+    read, is_closed = 0, False
 
+    def __iter__(self) -> Iterator[bytes]:
+        for _ in range(5):
+            self.read += 1
+            yield b"0123456789"
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+def test_a_download_is_given_piece_by_piece_and_may_be_left() -> None:
     pieces = Pieces()
     transport = httpx.MockTransport(lambda _: httpx.Response(200, stream=pieces))
     with Client("http://here", transport=transport) as client:
         download = client.download_signals("run_1")
-        assert next(iter(download)) == b"0123456789"
+        assert next(download) == b"0123456789"
         assert pieces.read < 5
+        assert not pieces.is_closed
+        del download  # as a loop that is left
+        assert pieces.is_closed
+
+
+def test_a_client_that_waits_works_where_a_loop_runs_as_in_a_notebook() -> None:
+    async def work() -> list[Any]:
+        pieces = Pieces()
+        transport = httpx.MockTransport(
+            lambda request: (
+                httpx.Response(200, stream=pieces)
+                if request.url.path.endswith(".mcap")
+                else answer_anything(request)
+            )
+        )
+        with Client("http://here", transport=transport) as client:
+            first = next(client.download_signals("run_1"))
+            assert pieces.is_closed
+            return [first, client.job("x")["id"], *client.iterate_jobs()]
+
+    assert awaited(work) == [b"0123456789", "x"]
+
+
+def test_a_step_that_waits_is_no_step_of_the_synchronous_client() -> None:
+    with pytest.raises(RuntimeError, match="waited"):
+        finish(asyncio.sleep(0))

@@ -1,6 +1,5 @@
 """The clients send a call again that a server could not serve just then, and only such a call."""
 
-import inspect
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
@@ -193,27 +192,6 @@ def test_events_are_asked_for_again_and_told_from_where_they_broke_off(
 def test_events_of_a_server_that_is_not_there() -> None:
     with pytest.raises(ServerUnreachable), Client("http://127.0.0.1:1") as client:
         list(client.events("job_1"))
-
-
-METHODS = [{name for name in dir(one) if not name.startswith("_")} for one in (Client, AsyncClient)]
-
-
-def test_both_clients_have_the_same_methods() -> None:
-    assert METHODS[0] == METHODS[1]
-
-
-@pytest.mark.parametrize("name", sorted(METHODS[0]))
-def test_methods_of_both_clients_have_the_same_parameters_and_docstring(name: str) -> None:
-    plain, twin = getattr(Client, name), getattr(AsyncClient, name)
-    assert inspect.signature(plain).parameters == inspect.signature(twin).parameters
-    assert inspect.getdoc(plain) == inspect.getdoc(twin)
-    gives, twin_gives = (inspect.signature(one).return_annotation for one in (plain, twin))
-    name_of_result = str(gives)
-    if "Iterator" in name_of_result or name == "runs":
-        assert str(twin_gives).startswith(("collections.abc.AsyncIterator", "AsyncIterator"))
-    else:
-        assert inspect.iscoroutinefunction(twin)
-        assert gives == twin_gives
 
 
 @both
