@@ -31,6 +31,8 @@ if TYPE_CHECKING:
         ServerUnreachable,
         WaitTimeout,
     )
+    from service.client.embedded import run_embedded_service
+    from service.core.errors import ServiceDidNotStart
     from service.formats.recordings import read_recording
     from sysid import (
         Channel,
@@ -99,6 +101,7 @@ __all__ = [
     "Recording",
     "SequenceSearch",
     "ServerUnreachable",
+    "ServiceDidNotStart",
     "Stop",
     "SysidError",
     "UnknownModel",
@@ -113,6 +116,7 @@ __all__ = [
     "load_identified",
     "load_model",
     "read_recording",
+    "run_embedded_service",
     "simulate",
 ]
 
@@ -183,7 +187,9 @@ _OTHER_MODULES = {
         ),
         "service.client",
     ),
+    "ServiceDidNotStart": "service.core.errors",
     "read_recording": "service.formats.recordings",
+    "run_embedded_service": "service.client.embedded",
 }
 """Modules of the names that are not those of `sysid`."""
 

@@ -31,7 +31,8 @@ def make_package(folder: Path, name: str, code: str = "") -> Path:
 
 
 def test_all_names_of_the_library_and_of_the_client_are_there() -> None:
-    assert {*sysid.__all__, *client.__all__, "read_recording"} == {*lagid.__all__}
+    others = {"ServiceDidNotStart", "read_recording", "run_embedded_service"}
+    assert {*sysid.__all__, *client.__all__, *others} == {*lagid.__all__}
     for name in sysid.__all__:
         assert getattr(lagid, name) is getattr(sysid, name)
     for name in client.__all__:
