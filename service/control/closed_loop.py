@@ -74,10 +74,12 @@ def simulate_closed_loop(
         If the controller is invalid, or the loop diverges.
     """
     from sysid.control.closed_loop import close_loop
+    from sysid.control.linear_form import IdentifiedModel
+    from sysid.simulation.simulate import complete_values
 
     solver = model.solver
     step = (solver.step or float(times[1] - times[0])) / solver.substeps
-    identified = _build_identified(model, values)
+    identified = IdentifiedModel.from_numbers(model, complete_values(model, values))
     try:
         used, tuning = _build_controller(identified, control)
         loop = close_loop(model, used, step)
@@ -144,25 +146,14 @@ def suggest_controller(
     model: Model, values: Mapping[str, float], input: str, output: str
 ) -> dict[str, float] | None:
     """Suggest gain and integral time by SIMC for a PI controller; None if it has no answer."""
-    from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
+    from sysid.control.linear_form import IdentifiedModel
     from sysid.control.tuning import tune_controller
 
-    complete = tuple(IdentifiedValue(name, value) for name, value in values.items())
     try:
-        tuned = tune_controller(IdentifiedModel(model, complete), input, output)
+        tuned = tune_controller(IdentifiedModel.from_numbers(model, values), input, output)
     except InvalidSettings:
         return None
     return {"gain": tuned.gain, "integral_time": tuned.integral_time}
-
-
-def _build_identified(model: Model, values: Mapping[str, float]) -> "IdentifiedModel":
-    from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
-    from sysid.simulation.simulate import complete_values
-
-    complete = complete_values(model, values)
-    return IdentifiedModel(
-        model, tuple(IdentifiedValue(name, value) for name, value in complete.items())
-    )
 
 
 def _build_controller(
