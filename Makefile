@@ -42,8 +42,8 @@ $(DOCS_READY): $(READY) docs/site/requirements.txt
 demo: $(READY)
 	@$(BIN)/lagid demo
 
-paper: $(READY)
-	@$(BIN)/lagid paper --force
+paper: warm
+	@$(BIN)/python -m examples.paper
 
 serve: warm
 	@exec $(BIN)/lagid serve

@@ -86,6 +86,8 @@ if TYPE_CHECKING:
     from service.client.calls import ServerUnreachable as ServerUnreachable
     from service.client.calls import WaitTimeout as WaitTimeout
     from service.client.client import Client as Client
+    from service.client.embedded import run_embedded_service as run_embedded_service
+    from service.core.errors import ServiceDidNotStart as ServiceDidNotStart
     from service.formats.recordings import read_recording as read_recording
     from sysid import *  # noqa: F403  # the names of the library
 

@@ -18,8 +18,8 @@ from service.jobs import submit
 from service.jobs.schemas import JobIn
 from service.queue.leases import LeaseQueue, ProgramOfJob
 from service.repositories.runs import RunRepository
+from tests.inline_executor import InlineExecutor
 from tests.rest import parts_of, recording, settings_of, store_csv
-from workers.inline_executor import InlineExecutor
 from workers.scheduler import Scheduler
 
 

@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from io import BytesIO
 
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from service.formats.mcap import write_recording
@@ -42,3 +43,9 @@ def foreign(
 def json_messages(topic: str, *values: dict[str, object]) -> list[tuple[str, int, bytes]]:
     """Messages of one topic, a tenth of a second apart."""
     return [(topic, k * 100_000_000, json.dumps(one).encode()) for k, one in enumerate(values)]
+
+
+def read_run_record(content: bytes) -> dict[str, str]:
+    """Read what a run's file says of its run, by the plain `mcap` reader."""
+    records = make_reader(BytesIO(content)).iter_metadata()
+    return next(record.metadata for record in records if record.name == "lagid.run")

@@ -72,11 +72,6 @@ _PANELS: Mapping[str, Mapping[str, tuple[Callable[..., None] | str, *tuple[str, 
             "lagid identify recording.csv --model tube --set parameters.L.upper=0.5",
             "lagid identify - --model fopdt --json < recording.csv",
         ),
-        "paper": (
-            "paper:reproduce_paper",
-            "lagid paper --quick",
-            "lagid paper --only table1,figure15 --output table1.html",
-        ),
     },
     "Data and models": {
         "datasets": (

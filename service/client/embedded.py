@@ -1,4 +1,4 @@
-"""Run a private service for the length of a `with` block: for the demo, benchmarks and tests."""
+"""Run a private service for the length of a `with` block."""
 
 import os
 import signal

@@ -11,7 +11,6 @@ from service.control.schemas import (
     ControllerOut,
     MarginsOut,
     StepMetricsOut,
-    TuningIn,
     TuningOut,
 )
 from service.core.errors import FieldError, InvalidRequest
@@ -24,7 +23,7 @@ from sysid.data.records import Channel
 from sysid.models.model import Model
 
 if TYPE_CHECKING:  # these import the compiler, which most requests never need
-    from sysid.control.controllers import PidControl, Transport
+    from sysid.control.controllers import PidControl
     from sysid.control.linear_form import IdentifiedModel
 
 
@@ -74,10 +73,12 @@ def simulate_closed_loop(
         If the controller is invalid, or the loop diverges.
     """
     from sysid.control.closed_loop import close_loop
+    from sysid.control.linear_form import IdentifiedModel
+    from sysid.simulation.simulate import complete_values
 
     solver = model.solver
     step = (solver.step or float(times[1] - times[0])) / solver.substeps
-    identified = _build_identified(model, values)
+    identified = IdentifiedModel.from_numbers(model, complete_values(model, values))
     try:
         used, tuning = _build_controller(identified, control)
         loop = close_loop(model, used, step)
@@ -144,25 +145,14 @@ def suggest_controller(
     model: Model, values: Mapping[str, float], input: str, output: str
 ) -> dict[str, float] | None:
     """Suggest gain and integral time by SIMC for a PI controller; None if it has no answer."""
-    from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
+    from sysid.control.linear_form import IdentifiedModel
     from sysid.control.tuning import tune_controller
 
-    complete = tuple(IdentifiedValue(name, value) for name, value in values.items())
     try:
-        tuned = tune_controller(IdentifiedModel(model, complete), input, output)
+        tuned = tune_controller(IdentifiedModel.from_numbers(model, values), input, output)
     except InvalidSettings:
         return None
     return {"gain": tuned.gain, "integral_time": tuned.integral_time}
-
-
-def _build_identified(model: Model, values: Mapping[str, float]) -> "IdentifiedModel":
-    from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
-    from sysid.simulation.simulate import complete_values
-
-    complete = complete_values(model, values)
-    return IdentifiedModel(
-        model, tuple(IdentifiedValue(name, value) for name, value in complete.items())
-    )
 
 
 def _build_controller(
@@ -170,63 +160,27 @@ def _build_controller(
 ) -> tuple["PidControl", TuningOut | None]:
     """Build the controller from its settings or from a tuning rule."""
     from sysid.control.controllers import PidControl, Transport
-
-    transport = None if control.transport is None else Transport(**control.transport.model_dump())
-    gain, integral_time, derivative_time = (
-        control.gain,
-        control.integral_time,
-        control.derivative_time,
-    )
-    chosen = None
-    if control.tuning is not None:
-        gain, integral_time, derivative_time, chosen = _tune_controller(
-            identified, control, control.tuning, transport
-        )
-    assert gain is not None
-    return PidControl(
-        control.input,
-        control.output,
-        gain,
-        control.limit,
-        transport,
-        integral_time=integral_time,
-        derivative_time=derivative_time,
-        derivative_filter=control.derivative_filter,
-        derivative_on=control.derivative_on,
-        setpoint_weight=control.setpoint_weight,
-        lower=control.lower,
-        upper=control.upper,
-        anti_windup=control.anti_windup,
-        tracking_time=control.tracking_time,
-    ), chosen
-
-
-def _tune_controller(
-    identified: "IdentifiedModel",
-    control: ControlIn,
-    tuning: TuningIn,
-    transport: "Transport | None",
-) -> tuple[float, float, float, TuningOut]:
     from sysid.control.tuning import tune_controller
 
-    result = tune_controller(
-        identified,
-        control.input,
-        control.output,
-        rule=tuning.rule,
-        controller=tuning.controller,
-        closed_loop_time_constant=tuning.closed_loop_time_constant,
-        transport=transport,
-    )
-    process = result.process
-    answer = TuningOut.from_source(
-        result,
-        process_gain=process.gain,
-        process_delay=process.delay,
-        process_time_constant=process.time_constant,
-        process_second_time_constant=process.second_time_constant,
-    )
-    return result.gain, result.integral_time, result.derivative_time, answer
+    settings = control.model_dump(exclude={"reference", "transport", "tuning"})
+    transport = None if control.transport is None else Transport(**control.transport.model_dump())
+    tuning = None
+    if control.tuning is not None:
+        rule = control.tuning.model_dump()
+        tuned = tune_controller(
+            identified, control.input, control.output, transport=transport, **rule
+        )
+        for name in ("gain", "integral_time", "derivative_time"):
+            settings[name] = getattr(tuned, name)
+        process = tuned.process
+        tuning = TuningOut.from_source(
+            tuned,
+            process_gain=process.gain,
+            process_delay=process.delay,
+            process_time_constant=process.time_constant,
+            process_second_time_constant=process.second_time_constant,
+        )
+    return PidControl(transport=transport, **settings), tuning
 
 
 def _compute_margins(identified: "IdentifiedModel", control: "PidControl") -> MarginsOut | None:

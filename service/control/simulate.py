@@ -72,8 +72,10 @@ def simulate_run(
     loop = _simulate_loop(request, body.control) if body.control else None
     result = _SimulationResult(
         outputs=_simulate_open_loop(request) if loop is None else loop.outputs,
-        inputs=[_sample_channel(channel, request.times) for channel in request.inputs]
-        + _list_plant_inputs(loop),
+        inputs=[
+            *(_sample_channel(channel, request.times) for channel in request.inputs),
+            *([] if loop is None else [loop.plant_input]),
+        ],
         notes=[*request.notes, *(loop.notes if loop else ())],
     )
     reference = (
@@ -203,10 +205,6 @@ def _simulate_loop(request: _SimulationRequest, control: ControlIn) -> LoopRespo
     return simulate_closed_loop(
         request.model, request.values, request.times, request.reference, request.inputs, control
     )
-
-
-def _list_plant_inputs(loop: LoopResponse | None) -> list[Channel]:
-    return [] if loop is None else [loop.plant_input]
 
 
 def _sample_channel(channel: Channel, times: FloatArray) -> Channel:

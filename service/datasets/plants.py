@@ -86,7 +86,7 @@ def _build_supply(
 
 
 def _simulate_actuator(body: SimulateIn, supply: Channel) -> tuple[Recording, dict[str, float]]:
-    from sysid.plants.actuator import Actuator, simulate_actuator
+    from service.plants.actuator import Actuator, simulate_actuator
 
     parameters = _check_parameters(Actuator, (), body.parameters)
     if "k_a" in parameters and "k_b" not in parameters:
@@ -100,7 +100,7 @@ def _simulate_actuator(body: SimulateIn, supply: Channel) -> tuple[Recording, di
 
 
 def _simulate_tube(body: SimulateIn) -> tuple[Recording, dict[str, float]]:
-    from sysid.plants.tube import Tube, add_gauge_errors, simulate_tube_record
+    from service.plants.tube import Tube, add_gauge_errors, simulate_tube_record
 
     if body.inputs:
         raise InvalidRequest.from_fault(

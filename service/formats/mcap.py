@@ -228,14 +228,6 @@ def _to_channels(fit: FittedOutput) -> tuple[Channel, ...]:
     )
 
 
-def read_run_metadata(
-    source: "McapSource", limits: UploadLimits = DEFAULT_LIMITS
-) -> dict[str, str]:
-    """Read the record ``lagid.run`` of a run's file; empty if there is none."""
-    with _open_binary(source) as (binary, size):
-        return dict(read_content(binary, size, limits).metadata.get(RUN_RECORD, {}))
-
-
 def _write_file(
     target: McapTarget,
     topics: Sequence[Topic],

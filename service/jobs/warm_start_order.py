@@ -38,11 +38,6 @@ class ChainLayout:
             stride *= length
         return cls(stride, lengths[chosen])
 
-    def find_previous(self, number: int) -> int | None:
-        """Return the number of the previous run; None for the first of its chain."""
-        first = number // self.stride % self.length == 0
-        return None if first else number - self.stride
-
     def find_chain(self, number: int) -> int:
         """Return the chain number of a run. Chains are numbered by their first runs."""
         block, offset = divmod(number, self.stride * self.length)

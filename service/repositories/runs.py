@@ -109,12 +109,6 @@ class RunRepository:
         cursors = (json.dumps([getattr(run, order), run.number]) for run in rows)
         return make_page(rows, limit, cursors)
 
-    def count_created(self, job_id: str) -> int:
-        """Count the created runs of a job, deleted ones too; they are always its first ones."""
-        of_job = Run.job_id == select_job_id(job_id, self._project_id)
-        last = self._session.scalar(select(func.max(Run.number)).where(of_job))
-        return 0 if last is None else int(last) + 1
-
     def count_states(self, job_id: str) -> dict[JobState, int]:
         """Count the runs of a job in each state."""
         of_job = filter_job(job_id, self._project_id)

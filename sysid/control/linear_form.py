@@ -5,7 +5,7 @@ The linear form is derived from the expression trees of the equations.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 from sysid.core.errors import SysidError
 from sysid.core.text import plain_estimate, plain_unit
@@ -79,6 +79,11 @@ class IdentifiedModel:
     version: str = ""
     provenance: Mapping[str, Any] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def from_numbers(cls, model: Model, numbers: Mapping[str, float]) -> Self:
+        """Give a model values that have no units and no errors."""
+        return cls(model, tuple(IdentifiedValue(name, value) for name, value in numbers.items()))
 
     def __repr__(self) -> str:
         values = (

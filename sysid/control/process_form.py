@@ -17,9 +17,8 @@ def recognise_process(identified: IdentifiedModel) -> Process | None:
 
     Examples
     --------
-    >>> names = {"K": 2.0, "T": 1.5, "L": 0.4, "y0": 20.0}
-    >>> values = tuple(IdentifiedValue(name, value) for name, value in names.items())
-    >>> recognise_process(IdentifiedModel(load_model("fopdt"), values)).time_constants
+    >>> values = {"K": 2.0, "T": 1.5, "L": 0.4, "y0": 20.0}
+    >>> recognise_process(IdentifiedModel.from_numbers(load_model("fopdt"), values)).time_constants
     (1.5,)
     """
     model = identified.model

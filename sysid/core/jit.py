@@ -35,7 +35,6 @@ _SOURCE_PATTERNS = (
     "search/*.py",
     "islands/*.py",
     "kernels/*.py",
-    "plants/*.py",
     "simulation/*.py",
     "uncertainty/local_algebra.py",
     "uncertainty/sensitivities.py",

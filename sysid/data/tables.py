@@ -37,7 +37,6 @@ from sysid.data.table_rules import (
 Labelled: TypeAlias = Any
 """A table, series or array of another library, with names and times."""
 
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _MIXED_ZONES = "some dates have a time zone and others have none; give all of them one"
 _MAX_VALUE = 60  # characters of a value that a message shows
 _NEED_TIMES = "need seconds, dates or time spans"

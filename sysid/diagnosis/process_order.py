@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
+from sysid.control.linear_form import IdentifiedModel
 from sysid.control.process_form import recognise_process
 from sysid.core.errors import SysidError
 from sysid.core.settings import FitSettings, Loss
@@ -239,11 +239,9 @@ def _changes_dynamics(process: Process, other: Process) -> bool:
 def _recognise(problem: Problem, theta: FloatArray) -> Process | None:
     values = problem.evaluator.template.copy()
     values[problem.evaluator.free_rows] = theta
-    named = tuple(
-        IdentifiedValue(parameter.name, value)
-        for parameter, value in zip(problem.all_parameters, values.tolist(), strict=True)
-    )
-    return recognise_process(IdentifiedModel(problem.model, named))
+    names = (parameter.name for parameter in problem.all_parameters)
+    numbers = dict(zip(names, values.tolist(), strict=True))
+    return recognise_process(IdentifiedModel.from_numbers(problem.model, numbers))
 
 
 def _fit_order(

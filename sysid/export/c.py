@@ -3,16 +3,12 @@
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from sysid.control.linear_form import IdentifiedModel
 from sysid.data.interpolation import MAX_POINTS_PER_STEP
 from sysid.export.description import describe_model, describe_unit, describe_values, wrap_source
-from sysid.export.expressions import (
-    HELPER_ARGUMENTS,
-    TargetLanguage,
-    write_expression,
-    write_number,
-)
+from sysid.export.expressions import TargetLanguage, write_expression, write_number
 from sysid.export.identifiers import Identifiers, escape_c_comment
 from sysid.export.program import (
     GeneratedProgram,
@@ -42,10 +38,11 @@ _LINE_WIDTH = 92
 
 @dataclass(slots=True)
 class CLanguage(TargetLanguage):
-    """C99 with math.h; `called_functions` collects the functions that are called."""
+    """C99 with math.h."""
 
+    logical_operators: ClassVar[Mapping[str, str]] = {"and": "&&", "or": "||"}
+    whole_division, length_argument = "/", "n, "
     called_functions: set[str] = field(default_factory=set)
-    logical_operators: Mapping[str, str] = field(default_factory=lambda: {"and": "&&", "or": "||"})
 
     def write_negation(self, condition: str) -> str:
         """Write ``not (…)``, valid anywhere."""
@@ -74,16 +71,6 @@ class CLanguage(TargetLanguage):
     def write_constant_dividend(self, above: str) -> str:
         """Write a dividend of numbers only: C needs nothing special."""
         return above
-
-    def write_element(self, array: str, index: str, divisor: int) -> str:
-        """Write the array element at the whole part of index / divisor."""
-        if divisor == 1:
-            return f"{array}[{index}]"
-        return f"{array}[{f'({index})' if '-' in index else index}/{divisor}]"
-
-    def write_signal_read(self, helper: str, signal: str, place: str) -> str:
-        """Write a call of a helper that reads an input."""
-        return f"{helper}({signal}, n, {place}{HELPER_ARGUMENTS[helper]})"
 
     def write_clamp(self, value: str, least: int, most: int) -> str:
         """Write a number limited to a range."""
@@ -143,9 +130,7 @@ def write_c_source(identified: IdentifiedModel) -> str:
         "free(work);",
         "return 0;",
     ]
-    helpers = list_needed_helpers(
-        HELPERS, program.helper_names | language.called_functions, identified
-    )
+    helpers = list_needed_helpers(HELPERS, program)
     parts = [
         _write_header(identified, stem),
         "#include <math.h>\n#include <stdlib.h>\n",

@@ -1,7 +1,7 @@
 """Expression trees as source text of a programming language."""
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 from sysid.language.functions import OPERATORS, Level
 from sysid.language.tables import TABLE_FUNCTIONS
@@ -27,10 +27,24 @@ HELPER_ARGUMENTS = {
 
 
 class TargetLanguage(Protocol):
-    """Syntax in which programming languages differ."""
+    """Syntax in which programming languages differ.
 
-    logical_operators: Mapping[str, str]
-    """``and`` and ``or``."""
+    Attributes
+    ----------
+    logical_operators : mapping of str to str
+        ``and`` and ``or``, where they are other words.
+    whole_division : str
+        Operator of the division of whole numbers that leaves out the rest.
+    length_argument : str
+        What a function that reads an input is given for its length, with a comma.
+    called_functions : set of str
+        Functions that were called and whose text the program may need.
+    """
+
+    logical_operators: ClassVar[Mapping[str, str]]
+    whole_division: ClassVar[str]
+    length_argument: ClassVar[str]
+    called_functions: set[str]
 
     def write_negation(self, condition: str) -> str:
         """Write ``not (…)``, valid anywhere."""
@@ -52,9 +66,13 @@ class TargetLanguage(Protocol):
 
     def write_element(self, array: str, index: str, divisor: int) -> str:
         """Write the array element at the whole part of index / divisor."""
+        if divisor == 1:
+            return f"{array}[{index}]"
+        return f"{array}[{f'({index})' if '-' in index else index}{self.whole_division}{divisor}]"
 
     def write_signal_read(self, helper: str, signal: str, place: str) -> str:
-        """Write a call of ``between`` or ``held``."""
+        """Write a call of a helper that reads an input."""
+        return f"{helper}({signal}, {self.length_argument}{place}{HELPER_ARGUMENTS[helper]})"
 
     def write_clamp(self, value: str, least: int, most: int) -> str:
         """Write a number limited to a range."""

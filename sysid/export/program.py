@@ -6,7 +6,7 @@ functions, which are written only if they are called.
 """
 
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import ceil
 from typing import Literal
@@ -488,16 +488,14 @@ _CALLED_HELPERS = {
 """Helpers that helpers call, each caller before those that it calls; a language may have fewer."""
 
 
-def list_needed_helpers(
-    helpers: Mapping[str, str], used: Iterable[str], identified: IdentifiedModel
-) -> list[str]:
+def list_needed_helpers(helpers: Mapping[str, str], program: GeneratedProgram) -> list[str]:
     """List the texts of used helpers and those they call, each before its caller."""
-    wanted = set(used)
+    wanted = program.helper_names | program.language.called_functions
     wanted |= {name.removesuffix("_on_grid") for name in wanted}
     for caller, called in _CALLED_HELPERS.items():
         if caller in wanted:
             wanted |= set(called)
-    variants = _find_variants(identified)
+    variants = _find_variants(program.identified)
     return [helpers[variants.get(name, name)] for name in helpers if name in wanted]
 
 

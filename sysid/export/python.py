@@ -3,16 +3,12 @@
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from sysid.control.linear_form import IdentifiedModel
 from sysid.data.interpolation import MAX_POINTS_PER_STEP
 from sysid.export.description import describe_model, describe_unit, describe_values, wrap_source
-from sysid.export.expressions import (
-    HELPER_ARGUMENTS,
-    TargetLanguage,
-    write_expression,
-    write_number,
-)
+from sysid.export.expressions import TargetLanguage, write_expression, write_number
 from sysid.export.identifiers import Identifiers, escape_docstring
 from sysid.export.program import (
     GeneratedProgram,
@@ -40,13 +36,11 @@ _LINE_WIDTH = 96
 
 @dataclass(slots=True)
 class PythonLanguage(TargetLanguage):
-    """Python, with NumPy's functions on single numbers: overflow gives ``inf``, not an error.
+    """Python, with NumPy's functions on single numbers: overflow gives ``inf``, not an error."""
 
-    `called_functions` collects the functions that are called and that NumPy does not have.
-    """
-
+    logical_operators: ClassVar[Mapping[str, str]] = {}
+    whole_division, length_argument = "//", ""
     called_functions: set[str] = field(default_factory=set)
-    logical_operators: Mapping[str, str] = field(default_factory=dict)
 
     def write_negation(self, condition: str) -> str:
         """Write ``not (…)``, valid anywhere."""
@@ -77,16 +71,6 @@ class PythonLanguage(TargetLanguage):
     def write_constant_dividend(self, above: str) -> str:
         """Write a dividend of numbers only."""
         return f"np.float64({above})"
-
-    def write_element(self, array: str, index: str, divisor: int) -> str:
-        """Write the array element at the whole part of index / divisor."""
-        if divisor == 1:
-            return f"{array}[{index}]"
-        return f"{array}[{f'({index})' if '-' in index else index}//{divisor}]"
-
-    def write_signal_read(self, helper: str, signal: str, place: str) -> str:
-        """Write a call of a helper that reads an input."""
-        return f"{helper}({signal}, {place}{HELPER_ARGUMENTS[helper]})"
 
     def write_clamp(self, value: str, least: int, most: int) -> str:
         """Write a number limited to a range."""
@@ -136,9 +120,7 @@ def write_python_source(identified: IdentifiedModel) -> str:
         *_write_delays(program),
         *_write_starts(program),
     ]
-    helpers = list_needed_helpers(
-        HELPERS, program.helper_names | language.called_functions, identified
-    )
+    helpers = list_needed_helpers(HELPERS, program)
     body = [*head, 'with np.errstate(all="ignore"):  # what diverges becomes inf or nan']
     body += indent_lines(loop)
     parts = [

@@ -13,8 +13,8 @@ from service.dispatch.leases import HeldLeases
 from service.sweeps.cramer_rao import StoredBounds
 from sysid.uncertainty.cramer_rao import cramer_rao_bound
 from tests.dispatching import Place
+from tests.inline_executor import InlineExecutor
 from tests.limits import LIMIT_SECONDS
-from workers.inline_executor import InlineExecutor
 
 pytestmark = pytest.mark.slow
 

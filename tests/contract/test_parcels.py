@@ -18,9 +18,9 @@ from service.repositories.jobs import JobRepository
 from service.storage.errors import LeaseLost, RowConflict
 from service.storage.tables import Checkpoint
 from tests.dispatching import Place, carry_out
+from tests.inline_executor import InlineExecutor
 from tests.results import conclude, write_results
 from tests.stored import job_of, parcels_of, record_outcomes, runs_of, state_of, submit
-from workers.inline_executor import InlineExecutor
 
 N_RUNS, SIZE = 10, 4
 SMALL = {"population": 8, "generations": 3, "islands": 1, "refine": False}

@@ -11,8 +11,8 @@ from service.repositories.jobs import JobRepository
 from service.storage.errors import ObjectStoreFailed
 from service.storage.garbage import delete_orphans
 from tests.dispatching import Place, carry_out
+from tests.inline_executor import InlineExecutor
 from workers import tasks
-from workers.inline_executor import InlineExecutor
 
 pytestmark = pytest.mark.slow
 

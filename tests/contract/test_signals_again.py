@@ -20,8 +20,8 @@ from service.storage.tables import Run
 from sysid.data.records import Recording
 from tests import polynomials
 from tests.dispatching import Place, carry_out
+from tests.inline_executor import InlineExecutor
 from tests.runs import step_record
-from workers.inline_executor import InlineExecutor
 
 SMALL = {"population": 16, "generations": 15, "islands": 1}
 SEEDS = {"axes": [{"path": "/seed", "range": [0, 2]}]}

@@ -19,7 +19,7 @@ from service.storage.tables import Run
 from sysid.core.errors import InvalidSettings
 from sysid.data.noise import Noise
 from tests.dispatching import Place, carry_out
-from workers.inline_executor import InlineExecutor
+from tests.inline_executor import InlineExecutor
 from workers.protocol import RunNotReady
 
 pytestmark = pytest.mark.slow

@@ -15,8 +15,8 @@ from service.dispatch.leases import HeldLeases
 from service.queue.orphaned_jobs import reap_jobs
 from service.storage.columns import utc_now
 from tests.dispatching import Place, until
+from tests.inline_executor import InlineExecutor
 from tests.stored import parcels_of
-from workers.inline_executor import InlineExecutor
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

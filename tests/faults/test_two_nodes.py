@@ -37,7 +37,7 @@ def plain(place: Place, job: str) -> list[dict[str, Any]]:
     """What the job's runs give in this process, without Ray."""
     from service.dispatch.dispatcher import Dispatcher
     from service.dispatch.leases import HeldLeases
-    from workers.inline_executor import InlineExecutor
+    from tests.inline_executor import InlineExecutor
 
     dispatcher = Dispatcher(
         place.database, place.store, InlineExecutor(), HeldLeases(place.database, 30)

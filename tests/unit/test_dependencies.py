@@ -49,7 +49,7 @@ def find_imports(paths: Iterable[Path]) -> set[str]:
                 names |= {alias.name.partition(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
                 names.add(str(node.module).partition(".")[0])
-    return names - sys.stdlib_module_names - {*PRODUCT, "tests", "benchmarks"}
+    return names - sys.stdlib_module_names - {*PRODUCT, "examples", "tests", "benchmarks"}
 
 
 def test_what_the_product_imports_is_declared() -> None:
@@ -69,7 +69,7 @@ def test_what_is_declared_is_imported() -> None:
 def test_what_tests_import_is_declared() -> None:
     declared = read_requirements("server", "postgres", "notebook", "test")
     names = {"pytest_timeout": "pytest_timeout", "pytest_xdist": "xdist", "moto": "moto"}
-    imported = find_imports(list_modules(("tests",)))
+    imported = find_imports(list_modules(("tests", "examples")))
     assert imported - declared - {*names.values()} == set()
 
 
@@ -143,7 +143,7 @@ def test_the_library_and_its_commands_need_no_extra(tmp_path: Path) -> None:
     data.write_text("\n".join(["t,u,y", *rows]))
     model.write_text("name: own\nform: differential\nstates: {x: m}\nequations: {x: -K*x}\n")
     fast = ("--set", "algorithm.generations=5", "--json")
-    served = [["serve"], ["dispatcher"], ["demo"], ["paper"], ["db", "check"]]
+    served = [["serve"], ["dispatcher"], ["demo"], ["db", "check"]]
     work = [
         ["identify", str(data), "--model", "fopdt", *fast],
         ["models", "--help"],

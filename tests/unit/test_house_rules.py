@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from tests.limits import LIMIT_SECONDS
 from tests.repository import ROOT
 from tests.sources import list_modules, read_facts
 
-CODE = ("lagid", "sysid", "workers", "service", "migrations", "tests", "benchmarks")
+CODE = ("lagid", "sysid", "workers", "service", "migrations", "examples", "tests", "benchmarks")
 MACHINE = re.compile(
     r"py[p]i\.org|python[h]osted|npm[j]s\.|deb\.[d]ebian|/wor[k]/|/far[m]/|/roo[t]/"
 )
@@ -34,7 +35,7 @@ def test_the_top_level_has_nothing_but_the_house() -> None:
         "LICENSE",
         "CITATION.cff",
     }
-    others = {"benchmarks", ".ci", ".gitignore", ".dockerignore"}
+    others = {"benchmarks", "examples", ".ci", ".gitignore", ".dockerignore"}
     entries = {path.relative_to(ROOT).parts[0] for path in _tracked()}
     assert {one for one in entries if not one.endswith(".md")} <= folders | files | others
 
@@ -51,11 +52,12 @@ PARTICIPLE = re.compile(
     r"^_*(?:told|kept|found|known|given|dealt|held|made|built|sent|[a-z]{2,}(?<!e)ed)(?:_|$)"
 )
 PRODUCT = ("lagid", "sysid", "workers", "service", "migrations")
+READ_BY_USERS = (*PRODUCT, "examples")
 
 
 def test_no_function_is_named_by_a_participle() -> None:
     named = []
-    for path in list_modules(PRODUCT):
+    for path in list_modules(READ_BY_USERS):
         facts = read_facts(path)
         values = [line for line in facts.properties if "_" not in line.text.strip("_")]
         named += [
@@ -81,7 +83,7 @@ def test_two_waits_of_a_test_end_before_the_limit_of_pytest() -> None:
 
 def test_no_class_name_is_used_twice() -> None:
     places: dict[str, list[str]] = {}
-    for path in list_modules(PRODUCT):
+    for path in list_modules(READ_BY_USERS):
         for name, line in read_facts(path).classes:
             places.setdefault(name, []).append(f"{path.relative_to(ROOT)}:{line}")
     assert {name: found for name, found in places.items() if len(found) > 1} == {}
@@ -119,6 +121,19 @@ def test_every_package_on_disk_is_listed_for_installation() -> None:
         for init in (ROOT / part).rglob("__init__.py")
     }
     assert names - {"service.guides"} == on_disk  # that one is the folder `docs`
+
+
+def test_examples_use_what_a_user_has() -> None:
+    """The public face, arrays and figures: whatever else an example needs is missing there."""
+    allowed = {*sys.stdlib_module_names, "examples", "lagid", "numpy", "plotly"}
+    imported = re.compile(r"^\s*(?:from|import) ((\w+)[\w.]*)", re.MULTILINE)
+    others = {
+        (str(path.relative_to(ROOT)), module)
+        for path in list_modules(("examples",))
+        for module, package in imported.findall(path.read_text())
+        if package not in allowed or module.startswith("lagid.")
+    }
+    assert others == set()
 
 
 def users_of(text: str) -> list[str]:

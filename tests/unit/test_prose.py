@@ -59,7 +59,7 @@ def test_sentences_of_documents_are_short(path: Path) -> None:
 def test_sentences_of_messages_are_short() -> None:
     long = [
         f"{path.relative_to(ROOT)}:{line}: {sentence}"
-        for path in list_modules(("lagid", "sysid", "workers", "service"))
+        for path in list_modules(("lagid", "sysid", "workers", "service", "examples"))
         if path not in PROGRAMS
         for text, line in read_facts(path).messages
         for sentence in re.split(r"(?<=[.!?])\s+", text)

@@ -13,11 +13,12 @@ from starlette.testclient import TestClient
 from service.api.app import create_app
 from service.api.dependencies import Parts
 from service.dispatch import fitted_signals
-from service.formats.mcap import read_fitted_outputs, read_mcap, read_run_metadata
+from service.formats.mcap import read_fitted_outputs, read_mcap
 from service.repositories.runs import RunRepository
 from service.storage.errors import ObjectStoreFailed
 from service.storage.tables import Run
 from tests.identified import identified
+from tests.mcap_files import read_run_record
 from tests.rest import recording, settings_of, store_csv
 from workers import job_queue, packing, tasks
 
@@ -102,7 +103,7 @@ def test_a_run_that_is_taken_over_shows_the_same_signals(served: Served) -> None
         )
         fits = [read_fitted_outputs(content) for content in (first, second)]
         assert fits[0][0].simulated.tobytes() == fits[1][0].simulated.tobytes()
-        about = read_run_metadata(second)
+        about = read_run_record(second)
         assert (about["run"], about["reused_from"]) == (new, old)  # a file of its own
 
 
@@ -110,7 +111,7 @@ def test_the_file_of_a_run_says_what_it_was_made_from(served: Served) -> None:
     run = served.runs[1]
     told = served.server.get(f"/v1/runs/{run}").json()
     content = served.server.get(f"/v1/runs/{run}/signals.mcap").content
-    about = read_run_metadata(content)
+    about = read_run_record(content)
     assert (about["run"], about["job"]) == (run, told["job"])
     for name in ("version", "fingerprint", "spec_hash"):
         assert about[name] == told[name]

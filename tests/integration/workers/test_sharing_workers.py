@@ -15,10 +15,10 @@ from service.queue.leases import Claim
 from service.storage.objects import open_store
 from service.storage.sessions import Database
 from tests.dispatching import Place
+from tests.inline_executor import InlineExecutor
 from tests.limits import LIMIT_SECONDS
 from tests.runs import ListedRuns, Notebook, bits, carry_out, spec
 from workers import packing
-from workers.inline_executor import InlineExecutor
 from workers.protocol import EvolveIsland, Pack, QueuedRun
 from workers.scheduler import Scheduler
 

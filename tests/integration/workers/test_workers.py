@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.inline_executor import InlineExecutor
 from tests.runs import ListedRuns, Notebook, bits, carry_out, spec
 from workers import packing
 from workers import ray_executor as module
 from workers.errors import ClusterLost
-from workers.inline_executor import InlineExecutor
 from workers.protocol import QueuedRun
 from workers.scheduler import Scheduler
 

@@ -31,7 +31,7 @@ def make_package(folder: Path, name: str, code: str = "") -> Path:
 
 LIBRARY, FACE = vars(sysid)["__all__"], vars(lagid)["__all__"]
 CLIENT = {"AsyncClient", "Client", "ClientError", "NotFinite", "ProblemError"}
-CLIENT |= {"ServerUnreachable", "WaitTimeout"}
+CLIENT |= {"ServerUnreachable", "ServiceDidNotStart", "WaitTimeout", "run_embedded_service"}
 
 
 def test_all_names_of_the_library_and_of_the_client_are_there() -> None:

@@ -23,9 +23,9 @@ from sysid.models.parse import parse_model
 from sysid.noise_models import generalised_least_squares
 from sysid.simulation.problem import Problem
 from tests.compiling import compile_here
+from tests.inline_executor import InlineExecutor
 from tests.polynomials import frols, lagged
 from tests.runs import RECORDS, bits, carry_out, spec
-from workers.inline_executor import InlineExecutor
 from workers.protocol import AdvanceRun, ProblemSpec, RunConclusion, RunFailure, RunSpec
 
 FAULTY_SEED = 13

@@ -1,5 +1,7 @@
 """Chains of a sweep side by side: each run once, behind those before it, and none held up."""
 
+from itertools import pairwise
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -27,7 +29,7 @@ def test_chains_share_out_the_runs_and_each_follows_the_order_of_its_axis(
     )
     for key, numbers in enumerate(chains):
         assert [chain.find_chain(number) for number in numbers] == [key] * length
-        assert [chain.find_previous(number) for number in numbers] == [None, *numbers[:-1]]
+        assert {later - number for number, later in pairwise(numbers)} <= {stride}
     assert [numbers[0] for numbers in chains] == sorted(numbers[0] for numbers in chains)
 
 
@@ -73,7 +75,7 @@ def test_a_run_begins_with_the_last_before_it_that_succeeded_in_its_own_chain(
         chains.end_run(number, {"a": float(number)})
     second = chains.take_ready(12, 12)
     assert [chains.find_previous_values(number, nothing) for number in second] == [
-        {"a": float(chain.find_previous(number) or 0)} for number in second
+        {"a": float(number - chain.stride)} for number in second
     ]
     chains.end_run(chain.list_runs(1)[1])
     (third,) = chains.take_ready(12, 12)

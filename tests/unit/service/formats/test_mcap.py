@@ -24,12 +24,11 @@ from service.formats.mcap import (
     FittedOutput,
     read_fitted_outputs,
     read_mcap,
-    read_run_metadata,
     write_fitted_outputs,
     write_recording,
 )
 from sysid.data.records import Channel, History, Recording, Segment
-from tests.mcap_files import recorded
+from tests.mcap_files import read_run_record, recorded
 
 TIMES = np.arange(40) * 0.01
 
@@ -314,7 +313,7 @@ def test_inputs_and_origin_of_a_run_are_in_its_file_under_fixed_topics() -> None
     assert summary is not None
     topics = [channel.topic for channel in summary.channels.values()]
     assert topics == ["/fit", "/inputs", "/inputs/2", "/inputs/3"]
-    assert read_run_metadata(content) == {"run": "run_1"}
+    assert read_run_record(content) == {"run": "run_1"}
     assert len(read_fitted_outputs(content)) == 1
     back = read_mcap(content)
     assert back.started_at == started

@@ -35,19 +35,16 @@ def test_the_run_before_differs_in_that_axis_only_by_one_step(
     cells = [dict(cell.values) for cell in iterate_cells(groups)]
     order = expand_values(next(axis for axis in axes if axis.path == along))
     for number, cell in enumerate(cells):
-        before = chain.find_previous(number)
+        numbers = chain.list_runs(chain.find_chain(number))
         place = order.index(cell[along])
-        if place == 0:
-            assert before is None
-        else:
-            assert before is not None
-            assert cells[before] == {**cell, along: order[place - 1]}
+        assert numbers.index(number) == place
+        if place > 0:
+            assert cells[numbers[place - 1]] == {**cell, along: order[place - 1]}
 
 
 @given(st.integers(1, 50), st.integers(1, 50), st.integers(0, 10_000))
-def test_every_chain_ends_at_its_first_run(stride: int, length: int, number: int) -> None:
-    chain, steps = ChainLayout(stride, length), 0
-    at: int | None = number
-    while at is not None:
-        at, steps = chain.find_previous(at), steps + 1
-    assert steps == number // stride % length + 1
+def test_every_run_is_in_its_chain_once(stride: int, length: int, number: int) -> None:
+    chain = ChainLayout(stride, length)
+    numbers = chain.list_runs(chain.find_chain(number))
+    assert len(numbers) == length
+    assert numbers.index(number) == number // stride % length

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sysid.control.controllers import PidControl
-from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
+from sysid.control.linear_form import IdentifiedModel
 from sysid.control.margins import compute_margins
 from sysid.models.parse import parse_model
 
@@ -22,7 +22,7 @@ def resonant(delay: float) -> IdentifiedModel:
             "outputs": {"y": {"expression": "0.9*x + 0.1*a", "unit": "m"}},
         }
     )
-    return IdentifiedModel(model, (IdentifiedValue("L", delay),))
+    return IdentifiedModel.from_numbers(model, {"L": delay})
 
 
 def first_order(rate: str) -> IdentifiedModel:
@@ -77,7 +77,7 @@ def test_a_sharp_resonance_is_not_missed(gain: float, delay: float) -> None:
         }
     )
     found = compute_margins(
-        IdentifiedModel(model, (IdentifiedValue("L", delay),)), PidControl("u", "y", gain)
+        IdentifiedModel.from_numbers(model, {"L": delay}), PidControl("u", "y", gain)
     )
     assert found.is_stable == (gain * np.sin(10 * delay) < 0)
     assert found.crossover_frequency == pytest.approx(10.0, rel=abs(gain))

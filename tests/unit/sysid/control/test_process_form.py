@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
+from sysid.control.linear_form import IdentifiedModel
 from sysid.control.process_form import recognise_process
 from sysid.models.catalogue.load import load_model
 from sysid.models.catalogue.processes import Process, list_neighbouring_orders
@@ -37,8 +37,7 @@ def write_model(
 
 
 def recognise(model: Model, values: Mapping[str, float]) -> Process | None:
-    named = tuple(IdentifiedValue(name, value) for name, value in values.items())
-    return recognise_process(IdentifiedModel(model, named))
+    return recognise_process(IdentifiedModel.from_numbers(model, values))
 
 
 FOPDT = {"K": 2.0, "T": 1.5, "L": 0.4, "y0": 20.0}

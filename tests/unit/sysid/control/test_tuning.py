@@ -9,7 +9,7 @@ import pytest
 
 from sysid.control.closed_loop import close_loop
 from sysid.control.controllers import PidControl, Transport
-from sysid.control.linear_form import IdentifiedModel, IdentifiedValue, NotLinear
+from sysid.control.linear_form import IdentifiedModel, NotLinear
 from sysid.control.margins import Margins, compute_margins
 from sysid.control.step_response import measure_step_response
 from sysid.control.tuning import Tuning, factor_transfer_function, tune_controller
@@ -22,9 +22,7 @@ from sysid.models.parse import parse_model
 
 def identified(model: Model, **values: float) -> IdentifiedModel:
     """A model with its values."""
-    return IdentifiedModel(
-        model, tuple(IdentifiedValue(name, value) for name, value in values.items())
-    )
+    return IdentifiedModel.from_numbers(model, values)
 
 
 def linear(equations: dict[str, str], output: str = "x1") -> IdentifiedModel:

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ive
 
-from sysid.core.errors import InvalidRecord, InvalidSettings
-from sysid.core.types import FloatArray
-from sysid.data.records import Channel
-from sysid.plants.tube import (
+from service.plants.tube import (
     GAS_CONSTANT,
     HEAT_CAPACITY_RATIO,
     PRANDTL,
@@ -20,6 +17,9 @@ from sysid.plants.tube import (
     simulate_tube,
     simulate_tube_record,
 )
+from sysid.core.errors import InvalidRecord, InvalidSettings
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel
 
 PERIOD = 1e-3
 AMBIENT = 1e5

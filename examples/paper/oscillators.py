@@ -6,15 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from service.paper import figures, published
-from service.paper.bench import METHODS, MethodRun, StudyBench
-from service.paper.cramer_rao import cramer_rao_bound
-from service.paper.document import Check, Plot, ReportTable, Section
-from service.paper.published import PublishedColumns
-from sysid.core.text import format_number, join_estimate
-from sysid.data.records import Channel
-from sysid.figures.data import Floats
-from sysid.models.catalogue.load import load_model
+from examples.paper import figures, published
+from examples.paper.bench import METHODS, MethodRun, StudyBench
+from examples.paper.cramer_rao import cramer_rao_bound
+from examples.paper.document import Check, Plot, ReportTable, Section, format_number
+from examples.paper.published import PublishedColumns
+from lagid import Channel
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,16 +125,16 @@ def _build_section(bench: StudyBench, example: Example, reading: EquationReading
         [estimates_table(example, runs, least), efforts_table(runs)],
         build_plots(example, runs),
         build_checks(example, runs, least),
-        links=[runs["improved"].run["job"]],
+        jobs=[runs["improved"].run["job"]],
     )
 
 
 def reading_bound(example: Example, reading: EquationReading) -> dict[str, float]:
     """Compute the Cramér–Rao bound of the reading's record."""
     times = np.arange(published.SAMPLES, dtype=np.float64) * published.SAMPLE_TIME
-    force: Floats = published.AMPLITUDE * np.cos(reading.omega * times)
+    force = published.AMPLITUDE * np.cos(reading.omega * times)
     inputs = [Channel("q", times, force, "N")]
-    return cramer_rao_bound(load_model(reading.model), inputs, example.true, published.SIGMA, times)
+    return cramer_rao_bound(reading.model, inputs, example.true, published.SIGMA, times)
 
 
 def estimates_table(
@@ -153,7 +150,7 @@ def estimates_table(
                 f"{true:g}",
                 f"{example.columns.simple[name]:.6f}",
                 f"{example.columns.proposed[name]:.6f}",
-                *(format_estimate(runs[method], name) for method in METHODS),
+                *(runs[method].format_estimate(name) for method in METHODS),
                 format_number(least[name], 2),
             ]
         )
@@ -200,12 +197,6 @@ def _compare_with_bound(example: Example, least: Mapping[str, float]) -> str:
     return f"{comparison}."
 
 
-def format_estimate(run: MethodRun, name: str) -> str:
-    """Format an estimate with its standard error, or with its status if there is none."""
-    text = join_estimate(run.get_estimate(name), run.get_standard_error(name))
-    return text if "±" in text else f"{text} ({run.get_parameter(name)['status']})"
-
-
 def efforts_table(runs: Mapping[str, MethodRun]) -> ReportTable:
     """Build the table of RMS and number of simulations of each method."""
     return ReportTable(
@@ -227,7 +218,7 @@ def build_plots(example: Example, runs: Mapping[str, MethodRun]) -> list[Plot]:
     return [
         Plot(
             f"Figure {number}: convergence of {' and '.join(pair)}",
-            figures.plot_convergence(runs, pair, example.true),
+            figures.draw_convergence(runs, pair, example.true),
             "Paper: the proposed search continues to the true values after the simple one has "
             f"stopped. Ours: {_describe_ends(ends, pair)}",
         )
@@ -235,7 +226,7 @@ def build_plots(example: Example, runs: Mapping[str, MethodRun]) -> list[Plot]:
     ] + [
         Plot(
             f"Figure {rms}: RMS of the best individual",
-            figures.plot_rms_history(runs, "m", published.SIGMA),
+            figures.draw_rms_history(runs, "m", published.SIGMA),
             f"Paper: the simple search {example.simple_search_remark}"
             ", the proposed one continues in steps. Ours: "
             + ", ".join(f"{method} ends at {value:.5f} m" for method, value in reached.items())
@@ -243,7 +234,7 @@ def build_plots(example: Example, runs: Mapping[str, MethodRun]) -> list[Plot]:
         ),
         Plot(
             f"Figure {response}: responses",
-            figures.plot_responses(runs),
+            figures.draw_responses(runs),
             "Paper: the simple search leaves a visible residual, the proposed one lies on the "
             "exact solution. Ours: RMS over the sd of the noise is "
             + ", ".join(f"{value / published.SIGMA:.2f} ({m})" for m, value in reached.items())

@@ -6,12 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from service.paper import figures, published
-from service.paper.bench import METHODS, MethodRun, StudyBench
-from service.paper.document import Check, Plot, ReportTable, Section
-from service.paper.oscillators import format_estimate
-from sysid.core.text import format_number
-from sysid.figures import theme
+from examples.paper import figures, published
+from examples.paper.bench import METHODS, MethodRun, StudyBench
+from examples.paper.document import Check, Plot, ReportTable, Section, format_number
 
 TITLE = "Table 4, Figures 20 and 21: pneumatic actuator"
 # The paper's proposed column, with k_b = k_a: only then P_a and θ determine the parameters. The
@@ -95,7 +92,7 @@ def _build_corrected_section(bench: StudyBench, record: str) -> Section:
         [_estimates_table(runs, "Table 4"), _step_table(steps, exact)],
         _build_plots(runs, steps, exact),
         _build_checks(runs, steps, exact),
-        links=[runs["improved"].run["job"]],
+        jobs=[runs["improved"].run["job"]],
     )
 
 
@@ -121,12 +118,12 @@ def _build_printed_section(bench: StudyBench, record: str) -> Section:
         [
             Plot(
                 "Figure 20, as printed: RMS of the best individual",
-                figures.plot_rms_history(runs, "mrad", 1e3 * SIGMA, scale=1e3),
+                figures.draw_rms_history(runs, "mrad", 1e3 * SIGMA, scale=1e3),
                 "Paper: falls gradually under the proposed search. Ours: "
                 f"{_format_final_rms(runs)}. A low RMS does not determine six numbers.",
             )
         ],
-        links=[runs["improved"].run["job"]],
+        jobs=[runs["improved"].run["job"]],
     )
 
 
@@ -165,7 +162,7 @@ def _estimates_table(runs: Mapping[str, MethodRun], title: str) -> ReportTable:
 
 def _format_cell(run: MethodRun, name: str) -> str:
     status = run.get_parameter(name)["status"]
-    text = format_estimate(run, name)
+    text = run.format_estimate(name)
     return text if status == "identified" or text.endswith(")") else f"{text} ({status})"
 
 
@@ -193,42 +190,40 @@ def _build_plots(
     runs: Mapping[str, MethodRun], steps: Mapping[str, Any], exact: Mapping[str, Any]
 ) -> list[Plot]:
     series = exact["outputs"][0]
-    heavy = {"color": theme.GREY, "width": 4}
+    heavy = {"color": figures.GREY, "width": 4}
     data = [
-        figures.line_trace(
-            "true parameters", series["times"], _to_degrees_series(series), line=heavy
-        )
+        figures.make_line("true parameters", series["times"], _to_degrees_series(series), heavy)
     ]
     for method, answer in steps.items():
         output = answer["outputs"][0]
         data.append(
-            figures.line_trace(
+            figures.make_line(
                 method,
                 output["times"],
                 _to_degrees_series(output),
-                line=figures.method_style(method),
+                figures.METHOD_LINES[method],
             )
         )
-    level = {"color": theme.GREY, "dash": "dot", "width": 1}
+    level = {"color": figures.GREY, "dash": "dot", "width": 1}
     end = series["times"][-1]
-    data.append(figures.line_trace("reference", [0, end], [90, 90], line=level))
+    data.append(figures.make_line("reference", [0, end], [90, 90], level))
     return [
         Plot(
             "Figure 20: RMS of the best individual",
-            figures.plot_rms_history(runs, "mrad", 1e3 * SIGMA, scale=1e3),
+            figures.draw_rms_history(runs, "mrad", 1e3 * SIGMA, scale=1e3),
             "Paper: the error becomes smaller gradually under the proposed search. "
             f"Ours: {_format_final_rms(runs)}; the noise has {1e3 * SIGMA:g} mrad.",
         ),
         Plot(
             "Figure 21: step response under P control",
-            figures.plot_lines(data, "time [s]", "angle θ [°]"),
+            figures.draw_lines(data, "time [s]", "angle θ [°]"),
             "Paper: the response of the proposed search's model lies on the experiment's. That of "
             "the simple search lies near it. Ours: the loop closed around each identified model, "
             "compared with the true parameters instead of the experiment.",
         ),
         Plot(
             "Response to the record's input",
-            figures.plot_responses(runs),
+            figures.draw_responses(runs),
             "Not in the paper: the record itself, with breaks where the arm sticks, and the "
             "residuals.",
         ),

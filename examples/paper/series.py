@@ -3,11 +3,9 @@
 from math import exp, factorial
 from typing import Any
 
-from service.paper import figures
-from service.paper.bench import StudyBench
-from service.paper.document import Plot, ReportTable, Section
-from sysid.core.text import format_number
-from sysid.figures import theme
+from examples.paper import figures
+from examples.paper.bench import StudyBench
+from examples.paper.document import Plot, ReportTable, Section, format_number
 
 RATE, END_TIME = 0.8, 5.0
 TERMS = (1, 2, 3, 4, 5)
@@ -44,7 +42,7 @@ def build_sections(bench: StudyBench) -> list[Section]:
         bench.say(f"paper Figures 2 and 3, {title}")
         lines = {n: _simulate_series(bench, n, period) for n in TERMS}
         rows.append(
-            [title, *(format_number(y[-1] - exact_solution(t[-1])) for t, y in lines.values())]
+            [title, *(format_number(y[-1] - exact_solution(t[-1]), 4) for t, y in lines.values())]
         )
         plots += _build_plots(title, lines)
     return [
@@ -83,19 +81,19 @@ def _simulate_series(bench: StudyBench, n: int, period: float) -> tuple[list[flo
 def _build_plots(title: str, lines: dict[int, tuple[list[float], list[float]]]) -> list[Plot]:
     times = next(iter(lines.values()))[0]
     fine = [END_TIME * k / 200 for k in range(201)]
-    solid = {"color": theme.GREY, "width": 2.4}
-    outputs = [figures.line_trace("exact", fine, [exact_solution(t) for t in fine], line=solid)]
+    solid = {"color": figures.GREY, "width": 2.4}
+    outputs = [figures.make_line("exact", fine, [exact_solution(t) for t in fine], solid)]
     errors = []
     for number, (n, (x, y)) in enumerate(lines.items()):
-        looks = {**theme.series_style(number), "dash": "dash"}
-        outputs.append(figures.line_trace(f"n = {n}", x, y, line=looks))
+        looks = {"color": figures.COLOURS[number], "dash": "dash", "width": 1.6}
+        outputs.append(figures.make_line(f"n = {n}", x, y, looks))
         off = [value - exact_solution(t) for t, value in zip(x, y, strict=True)]
-        errors.append(figures.line_trace(f"n = {n}", x, off, line={**looks, "dash": "solid"}))
+        errors.append(figures.make_line(f"n = {n}", x, off, {**looks, "dash": "solid"}))
     first, last = (abs(lines[n][1][-1] - exact_solution(times[-1])) for n in (TERMS[0], TERMS[-1]))
     return [
         Plot(
             f"Figure 2, {title}",
-            figures.plot_lines(outputs, "time [s]", "y"),
+            figures.draw_lines(outputs, "time [s]", "y"),
             "Paper: the dashed lines of the series approach the solid exact solution as n grows. "
             f"Ours too: n = {TERMS[-1]} reaches "
             f"{100 * lines[TERMS[-1]][1][-1] / exact_solution(times[-1]):.0f} % "
@@ -103,7 +101,7 @@ def _build_plots(title: str, lines: dict[int, tuple[list[float], list[float]]]) 
         ),
         Plot(
             f"Figure 3, {title}",
-            figures.plot_lines(errors, "time [s]", "ŷ − y"),
+            figures.draw_lines(errors, "time [s]", "ŷ − y"),
             "Paper: the error shrinks with n. Ours: at the end "
             f"{first:.3g} with n = {TERMS[0]} and {last:.3g} with n = {TERMS[-1]}.",
         ),

@@ -5,12 +5,12 @@ from math import copysign, pi
 import numpy as np
 import pytest
 
+from service.plants.actuator import Actuator, simulate_actuator
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import copy_catalogue_document, load_model
 from sysid.models.parse import parse_model
-from sysid.plants.actuator import Actuator, simulate_actuator
 from sysid.simulation.simulate import simulate
 from tests.catalogue_cases import ARM
 

@@ -1,8 +1,10 @@
 """Parts of a report as plain values: tables, figures and text."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import floor, log10
+
+from plotly.graph_objects import Figure
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +22,7 @@ class Plot:
     """A figure, and a caption that compares it with the paper's."""
 
     title: str
-    figure: Mapping[str, Any]
+    figure: Figure
     caption: str
 
 
@@ -34,30 +36,41 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One part of the study."""
+    """One part of the study, and the jobs that it is from."""
 
     title: str
-    text: str = ""
+    text: str
     tables: Sequence[ReportTable] = ()
     plots: Sequence[Plot] = ()
     checks: Sequence[Check] = ()
-    links: Sequence[str] = field(default=())
+    jobs: Sequence[str] = ()
+
+
+def format_number(value: float, digits: int) -> str:
+    """Format a number with so many significant digits."""
+    return f"{value:.{_count_decimals(value, digits)}f}".replace("-", "−")
+
+
+def format_estimate(value: float, stderr: float) -> str:
+    """Format an estimate and its standard error to the error's second significant digit."""
+    decimals = _count_decimals(stderr, 2)
+    return f"{value:.{decimals}f} ± {stderr:.{decimals}f}"
+
+
+def _count_decimals(value: float, digits: int) -> int:
+    if value == 0:
+        return 0
+    rounded = float(f"{abs(value):.{digits - 1}e}")  # 0.0996 to two digits is 0.10, not 0.100
+    return max(digits - 1 - floor(log10(rounded)), 0)
 
 
 def to_markdown(section: Section) -> str:
-    """Write the tables and checks of a section for the terminal; figures are in the report."""
-    blocks = [f"## {section.title}"]
-    if section.text:
-        blocks.append(section.text)
+    """Write text, tables and checks of a section for the terminal."""
+    blocks = [f"## {section.title}", section.text]
     for table in section.tables:
-        blocks += [f"**{table.title}**", _table_markdown(table)]
-        if table.note:
-            blocks.append(table.note)
-    if section.checks:
-        blocks.append(
-            "\n".join(f"- {describe_check(check)}: {check.text}" for check in section.checks)
-        )
-    return "\n\n".join(blocks) + "\n"
+        blocks += [f"**{table.title}**", _table_markdown(table), table.note]
+    blocks.append("\n".join(f"- {describe_check(c)}: {c.text}" for c in section.checks))
+    return "\n\n".join(filter(None, blocks)) + "\n"
 
 
 def describe_check(check: Check) -> str:

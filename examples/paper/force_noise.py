@@ -4,12 +4,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from plotly.graph_objects import Figure
 
-from service.client.calls import ProblemError
-from service.paper import figures, published
-from service.paper.bench import METHODS, StudyBench
-from service.paper.document import Plot, ReportTable, Section
-from service.paper.oscillators import EXAMPLE_1
+from examples.paper import figures, published
+from examples.paper.bench import METHODS, StudyBench
+from examples.paper.document import Plot, ReportTable, Section
+from examples.paper.oscillators import EXAMPLE_1
+from lagid import ProblemError
 
 FORCE_SIGMAS = (0.1, 0.5, 1.0, 2.0)
 PRINTED_SIGMAS = (0.01, 0.1)  # m
@@ -111,7 +112,7 @@ def build_section(bench: StudyBench, exact: str) -> Section:
                 "treats motion caused by φ as the system's own.",
             )
         ],
-        links=[runs[0]["job"]],
+        jobs=[runs[0]["job"]],
     )
 
 
@@ -175,7 +176,7 @@ def _median_error(runs: Sequence[Mapping[str, Any]], method: str, sigma: float) 
 
 def _plot_errors(
     runs: Sequence[Mapping[str, Any]], medians: Mapping[str, Sequence[float]]
-) -> dict[str, Any]:
+) -> Figure:
     data = []
     for method in METHODS:
         single = [
@@ -184,9 +185,9 @@ def _plot_errors(
             for value in _select_errors(runs, method, sigma)
         ]
         data += [
-            figures.marker_trace(method, [s for s, _ in single], [v for _, v in single], method),
-            figures.line_trace(
-                method, list(FORCE_SIGMAS), medians[method], line=figures.method_style(method)
+            figures.make_points(method, [s for s, _ in single], [v for _, v in single], method),
+            figures.make_line(
+                method, list(FORCE_SIGMAS), medians[method], figures.METHOD_LINES[method]
             ),
         ]
-    return figures.plot_lines(data, "standard deviation of φ [N]", "RMS error [m]")
+    return figures.draw_lines(data, "standard deviation of φ [N]", "RMS error [m]")

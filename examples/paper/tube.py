@@ -1,16 +1,13 @@
 """Table 3, Figures 17 and 18: the pneumatic tube of 40 m, two patterns."""
 
-import os
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from service.paper import figures, published
-from service.paper.bench import METHODS, MethodRun, StudyBench
-from service.paper.document import Check, Plot, ReportTable, Section
-from service.paper.oscillators import format_estimate
-from sysid.figures import theme
+from plotly.graph_objects import Figure
+
+from examples.paper import figures, published
+from examples.paper.bench import METHODS, MethodRun, StudyBench
+from examples.paper.document import Check, Plot, ReportTable, Section
 
 LENGTH_M = 40
 PARAMETER_NAMES = ("K", "T", "L")
@@ -18,33 +15,9 @@ TITLE = "Table 3, Figures 17 and 18: pneumatic tube of 40 m"
 L_TOLERANCE_S, T_TOLERANCE = 0.010, 0.03
 
 
-def find_records_folder() -> Path | None:
-    """Find the folder of the reference records below LAGID_DATA; None if they are absent."""
-    data = os.environ.get("LAGID_DATA")
-    folder = Path(data or Path("..") / "shared" / "data") / "tube_reference"
-    return folder if all(path.is_file() for path in _record_files(folder)) else None
-
-
-@dataclass(frozen=True, slots=True)
-class TubeRecords:
-    """One dataset for each pattern, the names of their channels, and their origin."""
-
-    datasets: list[str]
-    inlet: str
-    outlet: str
-    origin: str
-
-
-def store_records(bench: StudyBench) -> TubeRecords:
-    """Store the reference records of LAGID_DATA or, if absent, records of the reference plant."""
-    source = find_records_folder()
-    if source is not None:
-        ids = [
-            bench.client.add_dataset(path, name=path.stem)["id"] for path in _record_files(source)
-        ]
-        return TubeRecords(ids, "P1_meas_Pa", "P2_meas_Pa", "The records are those of LAGID_DATA")
-    bench.say("paper Table 3: the reference plant makes the records, as LAGID_DATA has none")
-    datasets = [
+def store_records(bench: StudyBench) -> list[str]:
+    """Store a record of the reference plant for each pattern."""
+    return [
         bench.client.simulate_dataset(
             {
                 "name": f"paper Table 3: tube {LENGTH_M} m, pattern {pattern}",
@@ -54,27 +27,22 @@ def store_records(bench: StudyBench) -> TubeRecords:
         )["id"]
         for pattern in (1, 2)
     ]
-    return TubeRecords(datasets, "P1", "P2", "LAGID_DATA has no records, so the service made them")
 
 
-def _record_files(source: Path) -> list[Path]:
-    return [source / f"tube_{LENGTH_M:03d}m_pattern{n}.csv" for n in (1, 2)]
-
-
-def job_body(records: TubeRecords) -> dict[str, Any]:
+def job_body(records: list[str]) -> dict[str, Any]:
     """Build the request of the job: each pattern by itself, with every method."""
     labels = [{"pattern": float(n)} for n in (1, 2)]
     return {
         "name": f"paper Table 3: tube {LENGTH_M} m",
         "model": "tube",
-        "datasets": records.datasets[:1],
-        "channels": {"u": records.inlet, "y": records.outlet},
+        "datasets": records[:1],
+        "channels": {"u": "P1", "y": "P2"},
         "algorithm": dict(published.SETTINGS),
         "sweep": {
             "axes": [
                 {
                     "path": "/datasets",
-                    "values": [[dataset] for dataset in records.datasets],
+                    "values": [[dataset] for dataset in records],
                     "labels": labels,
                 },
                 {"path": "/algorithm/method", "values": list(METHODS)},
@@ -95,8 +63,9 @@ def build_sections(bench: StudyBench) -> list[Section]:
         Section(
             TITLE,
             "Model `tube`, K e^(−Ls)/(Ts + 1) (Eq. 21), from the pressure at one gauge to the "
-            f"pressure at the other. {records.origin}: a gas-dynamic model of the paper's tube "
-            "with 12-bit gauges and noise of 0.5 kPa. The paper's own records are not published.",
+            "pressure at the other. The paper's records are not published. The reference plant "
+            "simulates them: gas dynamics in the paper's tube, with 12-bit gauges and noise of "
+            "0.5 kPa.",
             [_estimates_table(by_pattern)],
             [
                 plot
@@ -104,7 +73,7 @@ def build_sections(bench: StudyBench) -> list[Section]:
                 for plot in _build_plots(bench, n, by_method, records)
             ],
             build_checks(by_pattern),
-            links=[runs[0]["job"]],
+            jobs=[runs[0]["job"]],
         )
     ]
 
@@ -121,7 +90,7 @@ def _estimates_table(by_pattern: list[dict[str, MethodRun]]) -> ReportTable:
                     f"{label}, pattern {n + 1}",
                     f"{printed.simple[name]:.4f}",
                     f"{printed.proposed[name]:.4f}",
-                    *(format_estimate(by_method[method], name) for method in METHODS),
+                    *(by_method[method].format_estimate(name) for method in METHODS),
                 ]
             )
     for n, by_method in enumerate(by_pattern):
@@ -137,7 +106,7 @@ def _estimates_table(by_pattern: list[dict[str, MethodRun]]) -> ReportTable:
 
 
 def _build_plots(
-    bench: StudyBench, number: int, runs: Mapping[str, MethodRun], records: TubeRecords
+    bench: StudyBench, number: int, runs: Mapping[str, MethodRun], records: list[str]
 ) -> list[Plot]:
     pattern = number + 1
     rms = ", ".join(f"{m} ends at {runs[m].run['rms'] / 1e3:.2f} kPa" for m in METHODS)
@@ -150,31 +119,31 @@ def _build_plots(
         ),
         Plot(
             f"Figure 18: RMS of the best individual, pattern {pattern}",
-            figures.plot_rms_history(runs, "kPa", scale=1e-3),
+            figures.draw_rms_history(runs, "kPa", scale=1e-3),
             f"Paper: the error of the proposed search is smaller. Ours: {rms}.",
         ),
     ]
 
 
 def _plot_signals(
-    bench: StudyBench, runs: Mapping[str, MethodRun], records: TubeRecords, number: int
-) -> dict[str, Any]:
-    answer = bench.client.signals(records.datasets[number], 900)
+    bench: StudyBench, runs: Mapping[str, MethodRun], records: list[str], number: int
+) -> Figure:
+    answer = bench.client.signals(records[number], 900)
     channels = {channel["name"]: channel for channel in answer["channels"]}
-    looks = {records.inlet: (theme.GREEN, "inlet (1)"), records.outlet: (theme.GREY, "outlet (2)")}
+    looks = {"P1": (figures.GREEN, "inlet (1)"), "P2": (figures.GREY, "outlet (2)")}
     data = [
-        figures.line_trace(
+        figures.make_line(
             text,
             channels[name]["times"],
             _to_kilo(channels[name]["values"]),
-            line={"color": colour, "width": 1.6},
+            {"color": colour, "width": 1.6},
         )
         for name, (colour, text) in looks.items()
     ]
     model = runs["improved"].response["experiments"][0]["simulated"][0]
-    dashed = {**figures.method_style("improved"), "dash": "dash", "width": 1.4}
-    data.append(figures.line_trace("model", model["times"], _to_kilo(model["values"]), line=dashed))
-    return figures.plot_lines(data, "time [s]", "pressure [kPa absolute]")
+    dashed = {**figures.METHOD_LINES["improved"], "dash": "dash", "width": 1.4}
+    data.append(figures.make_line("model", model["times"], _to_kilo(model["values"]), dashed))
+    return figures.draw_lines(data, "time [s]", "pressure above atmosphere [kPa]")
 
 
 def _to_kilo(values: list[float | None]) -> list[float | None]:

@@ -4,15 +4,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from service.client.client import Client
-from service.core.errors import ServiceError
+from examples.paper.document import format_estimate
+from lagid import Client
 
 Document = Mapping[str, Any]
 METHODS = ("simple", "improved-paper", "improved")
 RESPONSE_POINTS = 700
 
 
-class StudyFailed(ServiceError):
+class StudyFailed(Exception):
     """A job of the study did not succeed."""
 
     def __init__(self, name: str, job: Document) -> None:
@@ -41,10 +41,11 @@ class MethodRun:
         """Return the estimate of a parameter."""
         return float(self.get_parameter(name)["value"])
 
-    def get_standard_error(self, name: str) -> float | None:
-        """Return the standard error of a parameter; None if there is none."""
-        stderr = self.get_parameter(name)["stderr"]
-        return None if stderr is None else float(stderr)
+    def format_estimate(self, name: str) -> str:
+        """Format an estimate with its standard error, or with its status if there is none."""
+        parameter = self.get_parameter(name)
+        value, stderr = parameter["value"], parameter["stderr"]
+        return format_estimate(value, stderr) if stderr else f"{value:.6g} ({parameter['status']})"
 
     def get_parameter(self, name: str) -> Document:
         """Return the entry of one parameter."""

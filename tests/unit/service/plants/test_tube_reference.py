@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sysid.plants.tube import Tube, build_excitation, simulate_tube_record
+from service.plants.tube import Tube, build_excitation, simulate_tube_record
 from tests.needs import DATA
 
 pytestmark = pytest.mark.data

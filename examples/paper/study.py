@@ -3,10 +3,9 @@
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 
-from service.core.errors import ServiceError
-from service.paper import actuator, noise, oscillators, series, tube
-from service.paper.bench import StudyBench
-from service.paper.document import Section
+from examples.paper import actuator, noise, oscillators, series, tube
+from examples.paper.bench import StudyBench
+from examples.paper.document import Section
 
 StudyPart = Callable[[StudyBench], list[Section]]
 PARTS: Mapping[str, StudyPart] = {
@@ -28,13 +27,13 @@ _FIGURES: Mapping[str, Iterable[int]] = {
 _PART_BY_FIGURE = {f"figure{number}": part for part, all_ in _FIGURES.items() for number in all_}
 
 
-class UnknownPart(ServiceError):
+class UnknownPart(Exception):
     """A part was asked for that the study does not have."""
 
     def __init__(self, name: str) -> None:
         numbers = ", ".join(name.removeprefix("figure") for name in _PART_BY_FIGURE)
         super().__init__(
-            f"--only: the study has no part {name!r}; need some of {', '.join(PARTS)}, "
+            f"the study has no part {name!r}; need some of {', '.join(PARTS)}, "
             f"or figureN with N of {numbers}"
         )
 

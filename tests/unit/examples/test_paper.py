@@ -1,16 +1,24 @@
-"""The study of the paper: the pure parts of its tables, figures and choice of parts."""
+"""The example that reproduces the paper: the pure parts of its tables, figures and parts."""
 
 import numpy as np
 import pytest
 
+from examples.paper import figures, force_noise, noise, oscillators, published, study
+from examples.paper.bench import ArchipelagoImprovement, MethodRun, champion_history
+from examples.paper.cramer_rao import cramer_rao_bound
+from examples.paper.document import (
+    Check,
+    ReportTable,
+    Section,
+    format_estimate,
+    format_number,
+    to_markdown,
+)
 from service.datasets.schemas import SimulateIn
 from service.jobs.schemas import JobIn
-from service.paper import figures, force_noise, noise, oscillators, published, study
-from service.paper.bench import ArchipelagoImprovement, MethodRun, champion_history
-from service.paper.cramer_rao import cramer_rao_bound
-from service.paper.document import Check, ReportTable, Section, to_markdown
+from sysid.core import text
 from sysid.data.records import Channel
-from sysid.models.catalogue.load import copy_catalogue_document, load_model
+from sysid.models.catalogue.load import copy_catalogue_document
 from sysid.models.parse import parse_model
 
 
@@ -62,17 +70,15 @@ def test_the_printed_errors_of_the_proposed_search_are_those_of_its_columns() ->
 
 
 def test_the_bound_of_a_mean_is_the_deviation_over_the_root_of_the_samples() -> None:
-    model = load_model(
-        {
-            "name": "mean",
-            "form": "difference",
-            "states": {"x": "1"},
-            "parameters": {"p": {"lower": 0, "upper": 5}},
-            "equations": {"x": "x(k-1)"},
-            "outputs": {"y": "x + p"},
-            "initial": {"x": 0},
-        }
-    )
+    model = {
+        "name": "mean",
+        "form": "difference",
+        "states": {"x": "1"},
+        "parameters": {"p": {"lower": 0, "upper": 5}},
+        "equations": {"x": "x(k-1)"},
+        "outputs": {"y": "x + p"},
+        "initial": {"x": 0},
+    }
     times = np.arange(100, dtype=np.float64)
     assert cramer_rao_bound(model, [], {"p": 2.0}, 0.5, times)["p"] == pytest.approx(0.05, rel=1e-6)
 
@@ -80,8 +86,7 @@ def test_the_bound_of_a_mean_is_the_deviation_over_the_root_of_the_samples() -> 
 def test_the_bound_of_example_1_is_that_of_the_literature_on_it() -> None:
     times = 0.02 * np.arange(300, dtype=np.float64)
     force = Channel("q", times, 10 * np.cos(5 * times), "N")
-    model = load_model("duffing-eq16")
-    found = cramer_rao_bound(model, [force], published.TRUE_1, 0.01, times)
+    found = cramer_rao_bound("duffing-eq16", [force], published.TRUE_1, 0.01, times)
     expected = {"c": 0.00486, "L": 0.00247, "b": 0.01980, "a": 0.02684}
     assert found == pytest.approx(expected, rel=0.02)
 
@@ -121,26 +126,19 @@ def test_the_spread_of_a_sweep_is_taken_for_each_level_and_method_by_itself() ->
 
 def test_a_table_in_the_terminal_has_one_width_and_keeps_its_marks() -> None:
     table = ReportTable("T", ["name", "x"], [["a|b", "1"], ["longer", "−2.5"]])
-    text = to_markdown(Section("S", tables=[table], checks=[Check("it is so", holds=False)]))
-    rows = [row for row in text.splitlines() if row.startswith("|")]
+    shown = to_markdown(Section("S", "", [table], checks=[Check("it is so", holds=False)]))
+    rows = [row for row in shown.splitlines() if row.startswith("|")]
     assert len(rows) == 4
     assert len({len(row) for row in rows}) == 1
-    assert "a\\|b" in text
-    assert "does NOT hold: it is so" in text
+    assert "a\\|b" in shown
+    assert "does NOT hold: it is so" in shown
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "marks"),
-    [(0.0131, 0.09, [0.01, 0.02, 0.05, 0.1]), (13.1, 85, [10, 20, 50, 100]), (0, 1, [])],
-)
-def test_marks_of_a_logarithmic_axis_enclose_what_is_drawn(
-    low: float, high: float, marks: list[float]
-) -> None:
-    assert figures.decade_marks(low, high) == marks
-
-
-def test_many_decades_are_marked_by_their_powers_alone() -> None:
-    assert figures.decade_marks(1e-9, 1.0) == [10.0**n for n in range(-9, 1)]
+@pytest.mark.parametrize("value", [-52.04, 0.0, 0.0996, 0.00247, 950.4, 5.0])
+@pytest.mark.parametrize("stderr", [4.1e-6, 0.0996, 1.0, 416.0])
+def test_numbers_have_the_digits_that_lagid_shows(value: float, stderr: float) -> None:
+    assert format_number(value, 2) == text.format_number(value, 2)
+    assert format_estimate(value, stderr).replace("-", "−") == text.join_estimate(value, stderr)
 
 
 def test_a_line_of_convergence_reaches_the_last_generation() -> None:
@@ -149,12 +147,12 @@ def test_a_line_of_convergence_reaches_the_last_generation() -> None:
         ArchipelagoImprovement(0, 3.0, {"a": 1.0}),
         ArchipelagoImprovement(7, 1.0, {"a": 2.0}),
     ]
-    figure = figures.plot_convergence({"simple": MethodRun(run, progress, {})}, ["a"], {"a": 2.5})
-    drawn = {trace["name"]: trace for trace in figure["data"]}
-    assert drawn["simple"]["x"] == [0, 7, 40]
-    assert drawn["simple"]["y"] == [1, 2, 2]
-    assert drawn["true value"]["y"] == [2.5, 2.5]
-    assert figure["layout"]["yaxis"]["title"]["text"] == "a [s]"
+    figure = figures.draw_convergence({"simple": MethodRun(run, progress, {})}, ["a"], {"a": 2.5})
+    drawn = {trace.name: trace for trace in figure.data}
+    assert drawn["simple"].x == (0, 7, 40)
+    assert drawn["simple"].y == (1, 2, 2)
+    assert drawn["true value"].y == (2.5, 2.5)
+    assert figure.layout.yaxis.title.text == "a [s]"
 
 
 def test_the_noise_enters_the_recursion_as_a_force_or_as_printed() -> None:

@@ -1,20 +1,18 @@
 """The Cramér–Rao bound of a model's parameters at their true values."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.data.records import Channel
-from sysid.models.model import Model
-from sysid.simulation.simulate import simulate
+from lagid import Channel, simulate
 
 RELATIVE_STEP = 1e-4
 
 
 def cramer_rao_bound(
-    model: Model,
-    inputs: list[Channel],
+    model: str | Mapping[str, object],
+    inputs: Sequence[Channel],
     true: Mapping[str, float],
     sigma: float,
     times: NDArray[np.float64],

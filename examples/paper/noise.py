@@ -6,12 +6,12 @@ from math import sqrt
 from typing import Any
 
 import numpy as np
+from plotly.graph_objects import Figure
 
-from service.paper import figures, force_noise, published
-from service.paper.bench import METHODS, StudyBench
-from service.paper.document import Check, Plot, ReportTable, Section
-from service.paper.oscillators import EXAMPLE_1, list_readings, record_body
-from sysid.figures import theme
+from examples.paper import figures, force_noise, published
+from examples.paper.bench import METHODS, StudyBench
+from examples.paper.document import Check, Plot, ReportTable, Section
+from examples.paper.oscillators import EXAMPLE_1, list_readings, record_body
 
 SIGMAS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 QUANTILES = (0.1, 0.5, 0.9)
@@ -124,13 +124,13 @@ def build_sections(bench: StudyBench) -> list[Section]:
                 ),
             ],
             _build_checks(errors),
-            links=[runs[0]["job"]],
+            jobs=[runs[0]["job"]],
         ),
         force_noise.build_section(bench, exact),
     ]
 
 
-def plot_spread(groups: dict[str, list[ReplicateErrors]], with_floor: bool) -> dict[str, Any]:
+def plot_spread(groups: dict[str, list[ReplicateErrors]], with_floor: bool) -> Figure:
     """Draw median, band and points over σ."""
     data = []
     for method, spread in groups.items():
@@ -138,15 +138,14 @@ def plot_spread(groups: dict[str, list[ReplicateErrors]], with_floor: bool) -> d
         low, middle, high = ([errors.quantiles[n] for errors in spread] for n in range(3))
         single = [(errors.sigma, value) for errors in spread for value in errors.values]
         data += [
-            figures.band_trace(x, low, high, method),
-            figures.marker_trace(method, [s for s, _ in single], [v for _, v in single], method),
-            figures.line_trace(method, x, middle, line=figures.method_style(method)),
+            figures.make_band(x, low, high, method),
+            figures.make_points(method, [s for s, _ in single], [v for _, v in single], method),
+            figures.make_line(method, x, middle, figures.METHOD_LINES[method]),
         ]
-    level = {"color": theme.GREY, "dash": "dot", "width": 1.6}
     name = "Cramér–Rao bound σ√(p/N)" if with_floor else "σ"
     least = [response_floor(s) if with_floor else s for s in SIGMAS]
-    data.append(figures.line_trace(name, list(SIGMAS), least, line=level))
-    return figures.plot_lines(data, "standard deviation of the noise σ [m]", "RMS error [m]")
+    data.append(figures.make_line(name, list(SIGMAS), least, figures.LEVEL))
+    return figures.draw_lines(data, "standard deviation of the noise σ [m]", "RMS error [m]")
 
 
 def _median_table(groups: dict[str, list[ReplicateErrors]]) -> ReportTable:

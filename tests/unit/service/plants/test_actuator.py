@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.plants import actuator
+from service.plants.actuator import MAX_SAMPLES, Actuator, simulate_actuator
 from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold
 from sysid.models.catalogue.load import copy_catalogue_document
 from sysid.models.parse import parse_model
-from sysid.plants import actuator
-from sysid.plants.actuator import MAX_SAMPLES, Actuator, simulate_actuator
 from sysid.simulation.simulate import simulate
 
 TIMES = 0.01 * np.arange(400)

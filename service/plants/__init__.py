@@ -1,0 +1,1 @@
+"""Reference plants that generate data, finer than their models: pneumatic tube and actuator."""

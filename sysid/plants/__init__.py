@@ -1,1 +1,0 @@
-"""Reference plants that generate data: pneumatic tube and actuator; optional."""
