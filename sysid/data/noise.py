@@ -24,8 +24,9 @@ class Noise:
     Attributes
     ----------
     sigma : float
-        Standard deviation, in the output's unit.
+        Standard deviation of the noise, in the unit of each output.
     seed : int
+        Seed of the noise; the same seed gives the same noise.
     kind : {"gaussian", "uniform-sum"}
         ``uniform-sum``: Eq. 20 with N = `terms`.
     terms : int
