@@ -80,7 +80,7 @@ class AlgorithmInDocument(TypedDict):
     selection_rate: NotRequired[float]
     """share of an island that survives"""
     mutation: NotRequired[list[list[int | float]]]
-    """probability of one flipped bit in a child from a generation on, as pairs of both. The first pair is of generation 0"""
+    """pairs of a generation and, from it on, the probability of one flipped bit in a child. The first generation is 0"""
     stagnation: NotRequired[int]
     """generations without a better champion before the sequence search, or a restart, begins"""
     sequence: NotRequired[SequenceInDocument]
@@ -739,7 +739,7 @@ class IslandInDocument(TypedDict):
     bits: NotRequired[int | None]
     """bits of each parameter in the chromosome"""
     mutation: NotRequired[list[list[int | float]] | None]
-    """probability of one flipped bit in a child from a generation on, as pairs of both"""
+    """pairs of a generation and, from it on, the probability of one flipped bit in a child"""
 
 
 class IslandDocument(TypedDict):
@@ -1811,13 +1811,13 @@ class StopInDocument(TypedDict):
     """End conditions in addition to the generations."""
 
     evaluations: NotRequired[int | None]
-    """most simulations of search, refinement, nearby minima, noise model, standard errors, orders and posterior; at least one population. An individual whose fitness is known counts too. Checks of the finished estimate are not counted"""
+    """most simulations, never exceeded, of search, refinement, nearby minima, noise model, standard errors, orders and posterior. At least one population. An individual whose fitness is known counts too; checks of the finished estimate do not"""
     seconds: NotRequired[float | None]
     """most computing time, s. Least squares may end a tenth later (0.2 to 10 s), and a warning lists what was left out. The result then depends on the machine"""
     rms: NotRequired[float | None]
     """RMS error at which the search stops, in the output's unit"""
     settled: NotRequired[int | None]
-    """confirmations of the best individual by independent restarts, besides two more and a third of all. null: never stop for them"""
+    """restarts that must end at the best individual, and two more, and a third of all. null: never stop for them"""
 
 
 class SubtractedDocument(TypedDict):

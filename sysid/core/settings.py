@@ -171,17 +171,17 @@ class Stop:
     Attributes
     ----------
     evaluations : int or None
-        Most simulations of search, refinement, nearby minima, noise model, standard errors, orders
-        and posterior; at least one population. An individual whose fitness is known counts too.
-        Checks of the finished estimate are not counted.
+        Most simulations, never exceeded, of search, refinement, nearby minima, noise model,
+        standard errors, orders and posterior. At least one population. An individual whose fitness
+        is known counts too; checks of the finished estimate do not.
     seconds : float or None
         Most computing time, s. Least squares may end a tenth later (0.2 to 10 s), and a warning
         lists what was left out. The result then depends on the machine.
     rms : float or None
         RMS error at which the search stops, in the output's unit.
     settled : int or None
-        Confirmations of the best individual by independent restarts, besides two more and a third
-        of all. None: never stop for them.
+        Restarts that must end at the best individual, and two more, and a third of all. None:
+        never stop for them.
 
     Examples
     --------
@@ -209,7 +209,7 @@ class IslandChange:
     bits : int or None
         Bits of each parameter in the chromosome.
     mutation : tuple of (generation, rate) or None
-        Probability of one flipped bit in a child from a generation on, as pairs of both.
+        Pairs of a generation and, from it on, the probability of one flipped bit in a child.
 
     Examples
     --------
@@ -245,8 +245,8 @@ class GeneticAlgorithm:
     selection_rate : float
         Share of an island that survives.
     mutation : tuple of (generation, rate)
-        Probability of one flipped bit in a child from a generation on, as pairs of both. The first
-        pair is of generation 0.
+        Pairs of a generation and, from it on, the probability of one flipped bit in a child. The
+        first generation is 0.
     stagnation : int
         Generations without a better champion before the sequence search, or a restart, begins.
     sequence : SequenceSearch
