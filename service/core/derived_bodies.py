@@ -70,7 +70,8 @@ def derive_fields(
 def take_setting(kind: type, name: str) -> Any:
     """Return the field of a body that is one setting of the core; the body states its type."""
     [field] = [field for field in fields(kind) if field.name == name]
-    bounds = find_bounds(get_type_hints(kind, include_extras=True)[name])
+    members = list_members(get_type_hints(kind, include_extras=True)[name])
+    bounds = next(filter(None, map(find_bounds, members)), None)
     return pydantic.Field(
         default=_to_default(field, {}),
         description=describe_settings(kind)[name],

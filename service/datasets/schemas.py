@@ -7,7 +7,7 @@ from pydantic import ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from service.core.derived_bodies import take_setting
-from service.core.wire import Answer, Body, DescribedBy, Labels, Page, Seed, Sigma
+from service.core.wire import Answer, Body, DescribedBy, Labels, Page, Seed
 from sysid.data.noise import Noise
 from sysid.data.records import Hold
 
@@ -81,7 +81,7 @@ InputIn = Annotated[
 class NoiseIn(Body):
     """Noise added to the measured outputs before fitting, for sensitivity studies."""
 
-    sigma: Sigma = take_setting(Noise, "sigma")
+    sigma: float = take_setting(Noise, "sigma")
     seed: Seed = take_setting(Noise, "seed")
 
 

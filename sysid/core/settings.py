@@ -5,9 +5,10 @@ means. The wire types of the service, its OpenAPI document, the client's types a
 `docs/job.md` are derived from it. So names and sentences here are those of a job.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import chain
 from types import NoneType, UnionType
 from typing import (
     Annotated,
@@ -104,7 +105,7 @@ class SequenceSearch:
 
     Attributes
     ----------
-    kind : {"paper", "adaptive"}
+    kind : SequenceKind
         Fixed steps (Eq. 11, 12), or least squares over a growing record.
     beta : float
         First step, as a share of the value or of the range.
@@ -133,7 +134,7 @@ class Migration:
     ----------
     every : int
         Generations between two migrations.
-    topology : {"one-way-ring", "ring", "fully-connected", "star", "unconnected"}
+    topology : TopologyName
         Which islands send to which.
     migrants : int
         Individuals that each island sends.
@@ -204,11 +205,11 @@ class IslandChange:
 
     Attributes
     ----------
-    method : {"simple", "improved-paper", "improved"} or None
+    method : SearchMethod or None
         Method of this island.
     bits : int or None
         Bits of each parameter in the chromosome.
-    mutation : tuple of (generation, rate) or None
+    mutation : MutationSchedule or None
         Pairs of a generation and, from it on, the probability of one flipped bit in a child.
 
     Examples
@@ -233,7 +234,7 @@ class GeneticAlgorithm:
 
     Attributes
     ----------
-    method : {"simple", "improved-paper", "improved"}
+    method : SearchMethod
         The paper's two methods as printed, or ours.
     population : int
         Individuals of all islands together, distributed as evenly as possible. The budget of
@@ -244,7 +245,7 @@ class GeneticAlgorithm:
         Bits of each parameter in the chromosome.
     selection_rate : float
         Share of an island that survives.
-    mutation : tuple of (generation, rate)
+    mutation : MutationSchedule
         Pairs of a generation and, from it on, the probability of one flipped bit in a child. The
         first generation is 0.
     stagnation : int
@@ -324,11 +325,11 @@ class Loss:
 
     Attributes
     ----------
-    kind : {"squares", "soft-l1"}
+    kind : LossKind
         What is minimised; ``soft-l1`` limits the influence of outliers.
     scale : float
         Residual beyond which ``soft-l1`` grows linearly, in the output's unit.
-    noise_model : {"auto", "white", "ar1"}
+    noise_model : NoiseModel
         Noise model of the estimates.
 
     Examples
@@ -364,7 +365,7 @@ class FitSettings:
     ----------
     parameters : mapping of str to mapping
         Changes of the model's parameters by name: bounds, scales, fixed values or ties.
-    prediction : {"simulation", "one-step"}
+    prediction : PredictionKind
         What is compared with the outputs: a free run from the model's own past, or predictions one
         step ahead from the measured past.
     loss : Loss
@@ -436,17 +437,15 @@ class _Rule:
 @lru_cache
 def _list_rules(kind: type) -> tuple[tuple[str, _Rule], ...]:
     """List the fields of settings that have choices or bounds."""
-    return tuple(_iterate_rules(kind))
+    hints = get_type_hints(kind, include_extras=True)
+    rules = ((name, _read_rule(list_members(hint))) for name, hint in hints.items())
+    return tuple((name, rule) for name, rule in rules if rule.choices or rule.bounds)
 
 
-def _iterate_rules(kind: type) -> Iterator[tuple[str, _Rule]]:
-    for name, annotation in get_type_hints(kind, include_extras=True).items():
-        members = list_members(annotation)
-        for member in members:
-            choices = get_args(member) if get_origin(member) is Literal else ()
-            bounds = find_bounds(member)
-            if choices or bounds:
-                yield name, _Rule(choices, bounds, NoneType in members)
+def _read_rule(members: Sequence[Any]) -> _Rule:
+    names = [get_args(member) for member in members if get_origin(member) is Literal]
+    bounds = filter(None, map(find_bounds, members))
+    return _Rule(tuple(chain(*names)), next(bounds, None), NoneType in members)
 
 
 def list_members(annotation: Any) -> tuple[Any, ...]:
@@ -468,8 +467,7 @@ def _require(holds: bool, pointer: str, value: object, allowed: str) -> None:
 def _require_schedule(schedule: MutationSchedule, pointer: str) -> None:
     generations = [generation for generation, _ in schedule]
     holds = (
-        bool(generations)
-        and generations[0] == 0
+        generations[:1] == [0]
         and generations[-1] <= MAX_GENERATIONS
         and generations == sorted(set(generations))
         and all(0 <= rate <= 1 for _, rate in schedule)
