@@ -431,7 +431,10 @@ class _Rule:
         return value in self.choices if self.bounds is None else self.bounds.hold(value)
 
     def __str__(self) -> str:
-        return ", ".join(map(str, self.choices)) if self.bounds is None else str(self.bounds)
+        if self.bounds is not None:
+            return str(self.bounds)
+        *others, last = map(str, self.choices)
+        return f"{', '.join(others)} or {last}"
 
 
 @lru_cache
