@@ -93,6 +93,7 @@ format: $(READY)
 
 docs: $(DOCS_READY) warm
 	$(BIN)/python -m tests.documents.settings
+	$(BIN)/python -m tests.documents.job
 	$(BIN)/python -m tests.documents.tutorials
 	$(BIN)/python -m tests.documents.photographs
 	@$(MAKE) --no-print-directory site

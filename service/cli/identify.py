@@ -466,13 +466,10 @@ def _run_identification(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from service.jobs.to_core import to_algorithm, to_loss
-    from sysid.core.settings import FitSettings
-    from sysid.data.noise import Noise
+    from service.jobs.to_core import read_run_settings
     from sysid.identification.identify import identify_records
 
-    document = body.to_normal_form()
-    algorithm = to_algorithm(document["algorithm"])
+    algorithm, fit, options = read_run_settings(body.to_normal_form(), in_sweep=False)
     columns = (
         BarColumn(bar_width=40),
         TextColumn("{task.percentage:>3.0f} %"),
@@ -496,19 +493,9 @@ def _run_identification(
             model,
             records,
             algorithm,
-            FitSettings(
-                document["parameters"],
-                body.prediction,
-                to_loss(document["loss"]),
-                body.weights,
-                body.skip,
-            ),
-            seed=body.seed,
-            posterior=body.posterior,
-            compare_orders=body.compare_orders is not False,
+            fit,
+            options,
             validation=validation_records or None,
-            validation_fraction=None if body.validation is None else body.validation.fraction,
-            noise=Noise(body.noise.sigma, body.noise.seed) if body.noise.sigma else None,
             progress=show,
             tell=tell,
         )

@@ -63,31 +63,31 @@ class AlgorithmInDocument(TypedDict):
     """Settings of the search."""
 
     method: NotRequired[Literal["simple", "improved-paper", "improved"]]
-    """method of the search"""
+    """the paper's two methods as printed, or ours"""
     population: NotRequired[int]
-    """individuals over all islands"""
+    """individuals of all islands together, distributed as evenly as possible. The budget of evaluations does not depend on the number of islands"""
     generations: NotRequired[int]
     """most generations"""
     bits: NotRequired[int]
     """bits of each parameter in the chromosome"""
     selection_rate: NotRequired[float]
-    """share of the population that survives"""
+    """share of an island that survives"""
     mutation: NotRequired[list[list[int | float]]]
-    """mutation rate from a generation on, as pairs of generation and rate"""
+    """pairs of a generation and, from it on, the probability of one flipped bit in a child. The first generation is 0"""
     stagnation: NotRequired[int]
-    """generations without a better champion until the sequence search begins"""
+    """generations without a better champion before the sequence search, or a restart, begins"""
     sequence: NotRequired[SequenceInDocument]
     """settings of the sequence search"""
     islands: NotRequired[int | list[IslandInDocument] | None]
-    """number of islands, or settings of each; null: chosen by the method"""
+    """number of islands, or the settings of each. null: 4 for `improved` with 16 individuals or more, else 1. The paper has no islands"""
     migration: NotRequired[MigrationInDocument]
     """exchange between islands"""
     refine: NotRequired[bool]
-    """whether least squares continues from the champions"""
+    """whether least squares continues from the champions of `improved`"""
     safe_limit: NotRequired[float | None]
-    """magnitude of a signal beyond which a simulation counts as unstable"""
+    """RMS error above which a result is not valid (section 3), in the output's unit"""
     stop: NotRequired[StopInDocument]
-    """further end conditions"""
+    """what ends the search before the last generation, whichever comes first"""
 
 class AuditEntryDocument(TypedDict):
     """One action: who did what to which object."""
@@ -691,9 +691,9 @@ class IslandInDocument(TypedDict):
     method: NotRequired[Literal["simple", "improved-paper", "improved"] | None]
     """method of this island"""
     bits: NotRequired[int | None]
-    """bits of each parameter"""
+    """bits of each parameter in the chromosome"""
     mutation: NotRequired[list[list[int | float]] | None]
-    """mutation rate from a generation on, as pairs of generation and rate"""
+    """pairs of a generation and, from it on, the probability of one flipped bit in a child"""
 
 class IslandDocument(TypedDict):
     """Champion of one island before and after its refinement."""
@@ -731,13 +731,13 @@ class JobInDocument(TypedDict):
     parameters: NotRequired[dict[str, ParameterInDocument]]
     """changes of the model's parameters by name"""
     prediction: NotRequired[Literal["simulation", "one-step"]]
-    """from its own past (simulation) or from the measured past"""
+    """what is compared with the outputs: a free run from the model's own past, or predictions one step ahead from the measured past"""
     loss: NotRequired[LossInDocument]
     """loss function"""
     weights: NotRequired[dict[str, float | list[float]] | None]
-    """weight of each output, or a list with one for each experiment; by default by the estimated noise of each output in each experiment"""
+    """weight of each output, one number or one for each experiment. null: 1 for one output, else 1 / its standard deviation; then the noise of each output in each experiment is estimated"""
     skip: NotRequired[int]
-    """samples at the start of each output that are not scored"""
+    """first samples of each output that are not scored"""
     algorithm: NotRequired[AlgorithmInDocument]
     """settings of the search"""
     priority: NotRequired[int]
@@ -753,7 +753,7 @@ class JobInDocument(TypedDict):
     noise: NotRequired[NoiseInDocument]
     """noise that is added before fitting"""
     seed: NotRequired[int]
-    """seed of the search; the same seed gives the same bits"""
+    """seed of the search; the same seed gives the same result, bit for bit"""
     sweep: NotRequired[SweepInDocument]
     """fields that change from run to run"""
     warm_start: NotRequired[str | None]
@@ -901,9 +901,9 @@ class LossInDocument(TypedDict):
     """Loss function: squares, or soft-l1 with a scale in the output's unit."""
 
     kind: NotRequired[Literal["squares", "soft-l1"]]
-    """squares, or soft-l1 where there are outliers"""
+    """what is minimised; `soft-l1` limits the influence of outliers"""
     scale: NotRequired[float]
-    """residual beyond which soft-l1 grows linearly, in the output's unit"""
+    """residual beyond which `soft-l1` grows linearly, in the output's unit"""
     noise_model: NotRequired[Literal["auto", "white", "ar1"]]
     """noise model of the estimates"""
 
@@ -1625,11 +1625,11 @@ class SequenceInDocument(TypedDict):
     """The sequence search."""
 
     kind: NotRequired[Literal["paper", "adaptive"]]
-    """kind of the sequence search"""
+    """fixed steps (Eq. 11, 12), or least squares over a growing record"""
     beta: NotRequired[float]
     """first step, as a share of the value or of the range"""
     relative: NotRequired[bool]
-    """whether steps are relative to the value"""
+    """whether steps are relative to the value (Eq. 12), else to the range"""
 
 class SeriesDocument(TypedDict):
     """One line of a plot, with at most the requested number of points."""
@@ -1707,13 +1707,13 @@ class StopInDocument(TypedDict):
     """End conditions in addition to the generations."""
 
     evaluations: NotRequired[int | None]
-    """most evaluations of a run"""
+    """most simulations, never exceeded, of search, refinement, nearby minima, noise model, standard errors, orders and posterior. At least one population. An individual whose fitness is known counts too; checks of the finished estimate do not"""
     seconds: NotRequired[float | None]
-    """most compute time of a run, s"""
+    """most computing time, s. Least squares may end a tenth later (0.2 to 10 s), and a warning lists what was left out. The result then depends on the machine"""
     rms: NotRequired[float | None]
-    """RMS error at which a run stops, in the output's unit"""
+    """RMS error at which the search stops, in the output's unit"""
     settled: NotRequired[int | None]
-    """further confirmations of the best individual; null: never stop for them"""
+    """restarts that must end at the best individual, and two more, and a third of all. null: never stop for them"""
 
 class SubtractedDocument(TypedDict):
     """What `detrend` subtracted from a channel: `value` + `slope`·(t − `time`)."""

@@ -107,14 +107,3 @@ class FaultOut(Answer):
 
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Sigma = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-
-
-class NoiseIn(Body):
-    """Noise added to the measured outputs before fitting, for sensitivity studies."""
-
-    sigma: Sigma = Field(
-        default=0.0, description="standard deviation of the noise, in the unit of each output"
-    )
-    seed: Seed = Field(
-        default=0, description="seed of the noise; the same seed gives the same noise"
-    )

@@ -6,7 +6,9 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from service.core.wire import Answer, Body, DescribedBy, Labels, NoiseIn, Page, Seed
+from service.core.derived_bodies import take_setting
+from service.core.wire import Answer, Body, DescribedBy, Labels, Page, Seed
+from sysid.data.noise import Noise
 from sysid.data.records import Hold
 
 MAX_SIMULATED_SAMPLES = 10_000_000
@@ -74,6 +76,13 @@ InputIn = Annotated[
     WaveInput | StepInput | BinaryInput | ExpressionInput | DatasetInput,
     Field(discriminator="kind"),
 ]
+
+
+class NoiseIn(Body):
+    """Noise added to the measured outputs before fitting, for sensitivity studies."""
+
+    sigma: float = take_setting(Noise, "sigma")
+    seed: Seed = take_setting(Noise, "seed")
 
 
 class SimulateIn(Body):

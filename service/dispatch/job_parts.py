@@ -14,7 +14,7 @@ from service.dispatch.encoding import ResultEncoder
 from service.dispatch.warm_starts import WarmStarts
 from service.jobs.axes import AxisGroup
 from service.jobs.stored_cells import build_stored_cells, read_axis_groups
-from service.jobs.to_core import fit_settings_of, to_algorithm
+from service.jobs.to_core import read_run_settings
 from service.models.models import load_stored_model
 from service.queue.run_writes import NewRun
 from service.repositories.datasets import DatasetRepository
@@ -26,6 +26,7 @@ from service.storage.tables import Dataset, Job
 from sysid.core.errors import SysidError
 from sysid.core.settings import GeneticAlgorithm
 from sysid.data.noise import Noise
+from sysid.identification.options import RunOptions
 from sysid.models.model import Model
 from workers.errors import RecordsUnavailable
 from workers.protocol import ProblemSpec, Records, RunSpec, WarmStartValues
@@ -44,32 +45,25 @@ class DataKey(NamedTuple):
 class SharedParts(NamedTuple):
     """What is equal in the runs of a sweep that differ only in `_OWN_PATHS`.
 
-    `problem` has no noise. `body` is the body of any of these runs.
+    `problem` has no noise. `warm_start` is what the runs name: none, a run, or the previous one.
     """
 
-    body: Mapping[str, Any]
     problem: ProblemSpec
     algorithm: GeneticAlgorithm
-    compare_orders: bool
-
-    @property
-    def reference(self) -> str | None:
-        """The warm start that the runs name: none, a run, or the previous one."""
-        reference: str | None = self.body["warm_start"]
-        return reference
+    options: RunOptions
+    warm_start: str | None
 
     def build_specification(self, cell: Mapping[str, Any], warm: WarmStartValues = ()) -> RunSpec:
         """Build the specification of one of these runs, with its warm start."""
-        body = self.body
-        sigma = cell.get("/noise/sigma", body["noise"]["sigma"])
-        noise = Noise(float(sigma), int(cell.get("/noise/seed", body["noise"]["seed"])))
+        options, noise = self.options, self.options.noise or Noise()
+        sigma, seed = cell.get("/noise/sigma", noise.sigma), cell.get("/noise/seed", noise.seed)
         return RunSpec(
-            self.problem.replace_noise(noise),
+            self.problem.replace_noise(Noise(float(sigma), seed)),
             self.algorithm,
-            int(cell.get("/seed", body["seed"])),
+            cell.get("/seed", options.seed),
             warm,
-            posterior=body.get("posterior", False),  # older jobs do not have it
-            compare_orders=self.compare_orders,
+            posterior=options.posterior,
+            compare_orders=options.compare_orders,
         )
 
 
@@ -127,25 +121,17 @@ class JobParts:
 
     def _build_shared_parts(self, body: Mapping[str, Any]) -> SharedParts:
         model = load_stored_model(body["model"])
-        validation = body["validation"] or {}
-        validation_datasets = validation.get("datasets")
+        in_sweep = bool(self.job.spec["sweep"]["axes"])
+        algorithm, fit, options = read_run_settings(body, in_sweep=in_sweep)
+        others = (body["validation"] or {}).get("datasets")
         problem = ProblemSpec(
             model=dict(model.document),
             records=self._register_data(body["datasets"], body, model),
-            validation=None
-            if validation_datasets is None
-            else self._register_data(validation_datasets, body, model),
-            validation_fraction=validation.get("fraction"),
-            settings=fit_settings_of(body),
+            validation=None if others is None else self._register_data(others, body, model),
+            validation_fraction=options.validation_fraction,
+            settings=fit,
         )
-        return SharedParts(
-            body, problem, to_algorithm(body["algorithm"]), self._compares_orders(body)
-        )
-
-    def _compares_orders(self, body: Mapping[str, Any]) -> bool:
-        """Whether the orders of a process are compared: by default only if there is no sweep."""
-        requested: bool | None = body.get("compare_orders")  # older jobs do not have it
-        return not self.job.spec["sweep"]["axes"] if requested is None else requested
+        return SharedParts(problem, algorithm, options, body["warm_start"])
 
     def load_records(self, key: str) -> Records:
         """Load the records of that key from the object store, or from the cache.
@@ -193,5 +179,5 @@ class JobParts:
 
 def _choose_keeping(job: Job, *, default: bool) -> bool:
     """Choose whether signals are stored: as the job says, else those of a single run."""
-    wanted = job.spec.get("keep_signals")  # older jobs do not have it
-    return job.n_runs == 1 or default if wanted is None else bool(wanted)
+    wanted: bool | None = job.spec["keep_signals"]
+    return job.n_runs == 1 or default if wanted is None else wanted

@@ -183,7 +183,7 @@ class JobRuns:
     def _build_queued_run(self, row: WaitingRun, state: RunState | None) -> QueuedRun | InvalidRun:
         try:
             shared = self.parts.share_parts(row.cell)
-            warm = self.parts.warm.find_values(row, shared.reference)
+            warm = self.parts.warm.find_values(row, shared.warm_start)
             spec = shared.build_specification(row.cell, warm)
         except (SysidError, ServiceError, StorageError) as error:
             return InvalidRun(row.id, RunFailure(str(error), type(error).__name__))

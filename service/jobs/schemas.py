@@ -1,7 +1,7 @@
 """Body of a job, and answers about jobs and accepted references.
 
-Names, defaults and bounds are those of `sysid.core.settings`. A narrower bound here limits what one
-request may ask of a server.
+Settings of the search and of the fit are derived from `sysid.core.settings`. A narrower bound here
+limits what one request may ask of a server.
 """
 
 from datetime import datetime
@@ -10,39 +10,29 @@ from typing import Annotated, Any, Self
 from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from service.core.derived_bodies import derive_fields, take_setting
 from service.core.states import StateName
-from service.core.wire import Answer, Body, DescribedBy, Labels, NoiseIn, Page, Pointer, Seed
+from service.core.wire import Answer, Body, DescribedBy, Labels, Page, Pointer, Seed
+from service.datasets.schemas import NoiseIn
 from service.items.reference_names import REFERENCE_PREFIX, RUN_PREFIX
 from sysid.core.settings import (
-    MAX_BITS,
-    MAX_EVALUATIONS,
-    MAX_GENERATIONS,
-    MIN_POPULATION,
+    FitSettings,
     GeneticAlgorithm,
+    IslandChange,
     Loss,
-    LossKind,
-    NoiseModel,
+    Migration,
     PredictionKind,
-    SearchMethod,
-    SequenceKind,
-    TopologyName,
+    SequenceSearch,
+    Stop,
 )
 from sysid.data.records import HoldSetting
+from sysid.identification.options import RunOptions
 from sysid.models.parameters import ParameterScale
 from sysid.results.verdict import Trust
 
-SEARCH, LOSS = GeneticAlgorithm(), Loss()
-"""Core settings, which provide the defaults."""
-
 WholeNumber = Annotated[int, Field(gt=-(2**62), lt=2**62)]
-PositiveCount = Annotated[int, Field(ge=1, le=MAX_GENERATIONS)]
-EvaluationLimit = Annotated[int, Field(ge=1, le=MAX_EVALUATIONS)]
-GenerationNumber = Annotated[int, Field(ge=0, le=MAX_GENERATIONS)]
-Bits = Annotated[int, Field(ge=1, le=MAX_BITS)]
 MAX_INDIVIDUALS = 100_000
-MutationSchedule = Annotated[
-    list[tuple[GenerationNumber, float]], Field(min_length=1, max_length=1000)
-]
+SCHEDULE_LENGTH = {"min_length": 1, "max_length": 1000}
 
 
 class ParameterIn(Body):
@@ -83,6 +73,7 @@ class ValidationIn(Body):
         return self
 
 
+@derive_fields(Loss)
 class LossIn(Body):
     """Loss function: squares, or soft-l1 with a scale in the output's unit.
 
@@ -90,53 +81,18 @@ class LossIn(Body):
     predicts left-out data better, if the residuals are coloured, else white.
     """
 
-    kind: LossKind = Field(
-        default=LOSS.kind, description="squares, or soft-l1 where there are outliers"
-    )
-    scale: float = Field(
-        default=LOSS.scale,
-        gt=0,
-        description="residual beyond which soft-l1 grows linearly, in the output's unit",
-    )
-    noise_model: NoiseModel = Field(
-        default=LOSS.noise_model, description="noise model of the estimates"
-    )
 
-
+@derive_fields(SequenceSearch)
 class SequenceIn(Body):
     """The sequence search."""
 
-    kind: SequenceKind = Field(
-        default=SEARCH.sequence.kind, description="kind of the sequence search"
-    )
-    beta: float = Field(
-        default=SEARCH.sequence.beta,
-        gt=0,
-        lt=1,
-        description="first step, as a share of the value or of the range",
-    )
-    relative: bool = Field(
-        default=SEARCH.sequence.relative, description="whether steps are relative to the value"
-    )
 
-
+@derive_fields(Migration, limits={"migrants": {"le": MAX_INDIVIDUALS}})
 class MigrationIn(Body):
     """Exchange between islands."""
 
-    every: PositiveCount = Field(
-        default=SEARCH.migration.every, description="generations between two migrations"
-    )
-    topology: TopologyName = Field(
-        default=SEARCH.migration.topology, description="which islands send to which"
-    )
-    migrants: int = Field(
-        default=SEARCH.migration.migrants,
-        ge=0,
-        le=MAX_INDIVIDUALS,
-        description="individuals that each island sends",
-    )
 
-
+@derive_fields(Stop, limits={"settled": {"le": 1_000_000}})
 class StopIn(Body):
     """End conditions in addition to the generations.
 
@@ -147,81 +103,23 @@ class StopIn(Body):
     nearby, `settled` of either kind and nearly all restarts must agree. Null disables it.
     """
 
-    evaluations: EvaluationLimit | None = Field(
-        default=SEARCH.stop.evaluations, description="most evaluations of a run"
-    )
-    seconds: float | None = Field(
-        default=SEARCH.stop.seconds, gt=0, description="most compute time of a run, s"
-    )
-    rms: float | None = Field(
-        default=SEARCH.stop.rms,
-        gt=0,
-        description="RMS error at which a run stops, in the output's unit",
-    )
-    settled: int | None = Field(
-        default=SEARCH.stop.settled,
-        ge=1,
-        le=1_000_000,
-        description="further confirmations of the best individual; null: never stop for them",
-    )
 
-
+@derive_fields(IslandChange, limits={"mutation": SCHEDULE_LENGTH})
 class IslandIn(Body):
     """Settings in which one island differs."""
 
-    method: SearchMethod | None = Field(default=None, description="method of this island")
-    bits: Bits | None = Field(default=None, description="bits of each parameter")
-    mutation: MutationSchedule | None = Field(
-        default=None,
-        description="mutation rate from a generation on, as pairs of generation and rate",
-    )
 
-
+@derive_fields(
+    GeneticAlgorithm,
+    {SequenceSearch: SequenceIn, Migration: MigrationIn, Stop: StopIn, IslandChange: IslandIn},
+    limits={
+        "population": {"le": MAX_INDIVIDUALS},
+        "generations": {"le": 10_000_000},
+        "mutation": SCHEDULE_LENGTH,
+    },
+)
 class AlgorithmIn(Body):
     """Settings of the search."""
-
-    method: SearchMethod = Field(default=SEARCH.method, description="method of the search")
-    population: int = Field(
-        default=SEARCH.population,
-        ge=MIN_POPULATION,
-        le=MAX_INDIVIDUALS,
-        description="individuals over all islands",
-    )
-    generations: int = Field(
-        default=SEARCH.generations, ge=1, le=10_000_000, description="most generations"
-    )
-    bits: Bits = Field(default=SEARCH.bits, description="bits of each parameter in the chromosome")
-    selection_rate: float = Field(
-        default=SEARCH.selection_rate,
-        gt=0,
-        lt=1,
-        description="share of the population that survives",
-    )
-    mutation: MutationSchedule = Field(
-        default=[*SEARCH.mutation],
-        description="mutation rate from a generation on, as pairs of generation and rate",
-    )
-    stagnation: PositiveCount = Field(
-        default=SEARCH.stagnation,
-        description="generations without a better champion until the sequence search begins",
-    )
-    sequence: SequenceIn = Field(
-        default=SequenceIn(), description="settings of the sequence search"
-    )
-    islands: int | list[IslandIn] | None = Field(
-        default=None,
-        description="number of islands, or settings of each; null: chosen by the method",
-    )
-    migration: MigrationIn = Field(default=MigrationIn(), description="exchange between islands")
-    refine: bool = Field(
-        default=SEARCH.refine, description="whether least squares continues from the champions"
-    )
-    safe_limit: float | None = Field(
-        default=SEARCH.safe_limit,
-        gt=0,
-        description="magnitude of a signal beyond which a simulation counts as unstable",
-    )
-    stop: StopIn = Field(default=StopIn(), description="further end conditions")
 
 
 MAX_AXIS_VALUES = 1_000_000
@@ -370,18 +268,10 @@ class IdentificationIn(Body):
     parameters: dict[str, ParameterIn] = Field(
         default={}, description="changes of the model's parameters by name"
     )
-    prediction: PredictionKind = Field(
-        default="simulation", description="from its own past (simulation) or from the measured past"
-    )
+    prediction: PredictionKind = take_setting(FitSettings, "prediction")
     loss: LossIn = Field(default=LossIn(), description="loss function")
-    weights: dict[str, float | list[float]] | None = Field(
-        default=None,
-        description="weight of each output, or a list with one for each experiment; by default "
-        "by the estimated noise of each output in each experiment",
-    )
-    skip: int = Field(
-        default=0, ge=0, description="samples at the start of each output that are not scored"
-    )
+    weights: dict[str, float | list[float]] | None = take_setting(FitSettings, "weights")
+    skip: int = take_setting(FitSettings, "skip")
     algorithm: AlgorithmIn = Field(default=AlgorithmIn(), description="settings of the search")
     priority: int = Field(
         default=0, ge=-100, le=100, description="jobs of higher priority come first"
@@ -414,9 +304,7 @@ class JobIn(IdentificationIn):
         default=None, description="data that are compared, but not fitted"
     )
     noise: NoiseIn = Field(default=NoiseIn(), description="noise that is added before fitting")
-    seed: Seed = Field(
-        default=1, description="seed of the search; the same seed gives the same bits"
-    )
+    seed: Seed = take_setting(RunOptions, "seed")
     sweep: SweepIn = Field(default=SweepIn(), description="fields that change from run to run")
     warm_start: Annotated[str, Field(max_length=300), AfterValidator(_check_warm_start)] | None = (
         Field(
@@ -425,9 +313,7 @@ class JobIn(IdentificationIn):
         )
     )
     trend: TrendIn | None = Field(default=None, description="trend of the estimates over a label")
-    posterior: bool = Field(
-        default=False, description="sample the posterior distribution of the free parameters"
-    )
+    posterior: bool = take_setting(RunOptions, "posterior")
     compare_orders: bool | None = Field(
         default=None,
         description="fit a process with dead time with one order more and one less, too; null: "

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from sqlalchemy.orm import Session
 
+from service.core.derived_bodies import read_settings
 from service.core.errors import Conflict
 from service.core.json_pointer import build_run_body
 from service.datasets.recordings import read_records
@@ -16,13 +17,13 @@ from service.datasets.rms_unit import find_rms_unit
 from service.datasets.signal_channels import SignalChannels, map_channels
 from service.jobs.job_parameters import list_job_parameters
 from service.jobs.results import read_noise_model
-from service.jobs.to_core import fit_settings_of
 from service.models.models import apply_result, load_stored_model
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.objects import ObjectStore
 from service.storage.tables import Job, Run
+from sysid.core.settings import FitSettings
 from sysid.data.noise import Noise
 from sysid.data.records import Record
 from sysid.models.model import Model, build_initial_parameters
@@ -113,7 +114,7 @@ class StoredRun:
             self.read_datasets(session, store, self.body["datasets"]),
             None if others is None else self.read_datasets(session, store, others),
             validation.get("fraction"),
-            Noise(float(self.body["noise"]["sigma"]), int(self.body["noise"]["seed"])),
+            read_settings(Noise, self.body["noise"]),
         )
 
     def problem(self, session: Session, store: ObjectStore) -> "Problem":
@@ -125,7 +126,7 @@ class StoredRun:
         parameters = (*self.model.parameters, *build_initial_parameters(self.model, len(records)))
         loss = {**self.body["loss"], "noise_model": read_noise_model(self.result)}
         body = {**self.body, "parameters": self._changes(parameters), "loss": loss}
-        settings, noise = fit_settings_of(body), self.result.get("noise_deviations")
+        settings, noise = read_settings(FitSettings, body), self.result.get("noise_deviations")
         if noise is not None:
             settings = replace(settings, deviations=tuple(map(tuple, noise)))
         return Problem.from_settings(self.model, records, settings)
@@ -148,7 +149,7 @@ class StoredRun:
         model, records = self.model_of_request, self.read_fit_records(session, store)
         substeps = self.result.get("substeps", model.solver.substeps)
         estimates = [to_estimate(document) for document in self.estimates]
-        settings = fit_settings_of(self.body)
+        settings = read_settings(FitSettings, self.body)
         return records, resimulate_run(model, records, settings, estimates, substeps)
 
     def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:

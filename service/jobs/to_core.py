@@ -1,76 +1,45 @@
-"""Conversion of stored and wire documents to values of the numerical core.
+"""The one way from a job body to the core: search, fit and options of a run.
 
-It is separate from the wire types, so that a client does not load NumPy.
+The command line, the dispatcher and the views of a stored run go it. It is apart from the wire
+types, and loads no compiler.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
-from sysid.core.settings import (
-    FitSettings,
-    GeneticAlgorithm,
-    IslandChange,
-    Loss,
-    Migration,
-    SequenceSearch,
-    Stop,
-)
+from service.core.derived_bodies import read_settings
+from sysid.core.settings import FitSettings, GeneticAlgorithm
+from sysid.data.noise import Noise
+from sysid.identification.options import RunOptions
 
 
-def to_algorithm(document: Mapping[str, Any]) -> GeneticAlgorithm:
-    """Build the search settings from the ``algorithm`` of a job body in its normal form.
+class RunSettings(NamedTuple):
+    """What a body says of a run, besides its model and its recordings."""
+
+    algorithm: GeneticAlgorithm
+    fit: FitSettings
+    options: RunOptions
+
+
+def read_run_settings(body: Mapping[str, Any], *, in_sweep: bool) -> RunSettings:
+    """Read what a body in its normal form says of a run.
+
+    By default the orders of a process are compared in a run alone, not `in_sweep`.
 
     Raises
     ------
     InvalidSettings
         With the pointer of the field that cannot be used.
     """
-    fields = dict(document)
-    fields["mutation"] = _to_schedule(fields["mutation"])
-    fields["sequence"] = SequenceSearch(**fields["sequence"])
-    fields["migration"] = Migration(**fields["migration"])
-    fields["stop"] = Stop(**fields["stop"])
-    if isinstance(fields["islands"], list):
-        fields["islands"] = tuple(_to_island_change(change) for change in fields["islands"])
-    return GeneticAlgorithm(**fields)
-
-
-def to_loss(document: Mapping[str, Any]) -> Loss:
-    """Build the loss from the ``loss`` of a job body.
-
-    Raises
-    ------
-    InvalidSettings
-        If its kind or scale cannot be used.
-    """
-    return Loss(**document)
-
-
-def fit_settings_of(body: Mapping[str, Any]) -> FitSettings:
-    """Build the fit settings, without model and records, from a job body in its normal form.
-
-    Raises
-    ------
-    InvalidSettings
-        If a setting cannot be used.
-    """
-    return FitSettings(
-        parameters=body["parameters"],
-        prediction=body["prediction"],
-        loss=to_loss(body["loss"]),
-        weights=body["weights"],
-        skip=body["skip"],
+    compared = body["compare_orders"]
+    return RunSettings(
+        read_settings(GeneticAlgorithm, body["algorithm"]),
+        read_settings(FitSettings, body),
+        RunOptions(
+            seed=body["seed"],
+            validation_fraction=(body["validation"] or {}).get("fraction"),
+            noise=read_settings(Noise, body["noise"]),
+            posterior=body["posterior"],
+            compare_orders=not in_sweep if compared is None else compared,
+        ),
     )
-
-
-def _to_island_change(change: Mapping[str, Any]) -> IslandChange:
-    mutation = change.get("mutation")
-    return IslandChange(
-        method=change.get("method"),
-        bits=change.get("bits"),
-        mutation=None if mutation is None else _to_schedule(mutation),
-    )
-
-
-def _to_schedule(pairs: Any) -> tuple[tuple[int, float], ...]:
-    return tuple((int(generation), float(rate)) for generation, rate in pairs)

@@ -7,6 +7,7 @@ from sysid.core.settings import (
     NOISE_MODELS,
     PREDICTION_KINDS,
     SEARCH_METHODS,
+    FitSettings,
     GeneticAlgorithm,
     Loss,
 )
@@ -25,7 +26,7 @@ DEFAULTS: Mapping[str, str] = {
     "method": GeneticAlgorithm().method,
     "loss": Loss().kind,
     "noise_model": Loss().noise_model,
-    "prediction": "simulation",
+    "prediction": FitSettings().prediction,
     "hold": "",
 }
 """Preselected names; no hold, since the recording has one."""

@@ -5,10 +5,12 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from service.core.derived_bodies import take_setting
 from service.core.wire import Answer, Body, Cell, Seed, Sigma
 from service.datasets.schemas import MAX_SIMULATED_SAMPLES, InputIn, SampleTime
 from service.jobs.schemas import IdentificationIn, TrendX, ValidationIn
 from sysid.core.settings import SearchMethod
+from sysid.identification.options import RunOptions
 
 MAX_REPLICATES = 1_000_000
 """The seed of replicate r is `seed` times this plus r, so that sweeps share no seed by chance."""
@@ -127,7 +129,7 @@ class ReidentifyIn(IdentificationIn):
     validation: ValidationIn | None = Field(
         default=None, description="data that are compared, but not fitted"
     )
-    seed: Seed = Field(default=1, description="seed of the search")
+    seed: Seed = take_setting(RunOptions, "seed")
 
     @property
     def job_fields(self) -> dict[str, Any]:

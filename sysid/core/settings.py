@@ -1,12 +1,25 @@
 """Settings of a search and of the problem it solves, as frozen values.
 
-The field names are those of the job body. Choices, defaults and bounds are defined here once. The
-wire schemas, the forms and the command line take them from here.
+This is their only declaration: name, type, default, bounds, and under "Attributes" what each one
+means. The wire types of the service, its OpenAPI document, the client's types and the table in
+`docs/job.md` are derived from it. So names and sentences here are those of a job.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias, get_args
+from functools import lru_cache
+from itertools import chain
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    TypeAlias,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from sysid.core.errors import InvalidSettings
 
@@ -29,16 +42,75 @@ MAX_BITS = 32
 # The compiled search counts these in 64 bits; a run of years does not come near them.
 MAX_GENERATIONS = 10**9
 MAX_EVALUATIONS = 10**12
-MutationSchedule = tuple[tuple[int, float], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Bounds:
+    """Bounds of a number, in the annotation of its field; None: unbounded on that side.
+
+    Attributes
+    ----------
+    least, most : float or None
+        Bounds that the number may take.
+    above, below : float or None
+        Bounds that it may not take.
+
+    Examples
+    --------
+    >>> Bounds(least=1, most=32)
+    1 to 32
+    >>> Bounds(above=0).hold(0)
+    False
+    """
+
+    least: float | None = None
+    above: float | None = None
+    below: float | None = None
+    most: float | None = None
+
+    def hold(self, value: float) -> bool:
+        """Test whether a number is within the bounds; NaN is not."""
+        return (
+            (self.least is None or value >= self.least)
+            and (self.above is None or value > self.above)
+            and (self.below is None or value < self.below)
+            and (self.most is None or value <= self.most)
+        )
+
+    def __repr__(self) -> str:
+        if self.least is not None and self.most is not None:
+            return f"{self.least} to {self.most}"
+        if self.above is not None and self.below is not None:
+            return f"between {self.above} and {self.below}"
+        ends = (
+            (self.least, f"{self.least} or more"),
+            (self.above, "positive" if self.above == 0 else f"above {self.above}"),
+            (self.below, f"below {self.below}"),
+            (self.most, f"{self.most} or less"),
+        )
+        return ", ".join(text for end, text in ends if end is not None)
+
+
+Count: TypeAlias = Annotated[int, Bounds(least=1, most=MAX_GENERATIONS)]
+Generation: TypeAlias = Annotated[int, Bounds(least=0, most=MAX_GENERATIONS)]
+Bits: TypeAlias = Annotated[int, Bounds(least=1, most=MAX_BITS)]
+Share: TypeAlias = Annotated[float, Bounds(above=0, below=1)]
+Positive: TypeAlias = Annotated[float, Bounds(above=0)]
+MutationSchedule: TypeAlias = tuple[tuple[Generation, float], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class SequenceSearch:
-    """The paper's sequence search (Eq. 11, 12).
+    """The paper's sequence search (Eq. 11, 12), or the one that learns steps and directions.
 
-    With ``kind="paper"`` the step stays fixed. With ``kind="adaptive"`` the search learns step
-    sizes and directions. `beta` is the step, relative to the value (`relative`, Eq. 12) or to the
-    range.
+    Attributes
+    ----------
+    kind : SequenceKind
+        Fixed steps (Eq. 11, 12), or least squares over a growing record.
+    beta : float
+        First step, as a share of the value or of the range.
+    relative : bool
+        Whether steps are relative to the value (Eq. 12), else to the range.
 
     Examples
     --------
@@ -47,18 +119,25 @@ class SequenceSearch:
     """
 
     kind: SequenceKind = "adaptive"
-    beta: float = 0.01
+    beta: Share = 0.01
     relative: bool = True
 
     def __post_init__(self) -> None:
-        allowed = ", ".join(SEQUENCE_KINDS)
-        _require(self.kind in SEQUENCE_KINDS, "sequence/kind", self.kind, allowed)
-        _require(0 < self.beta < 1, "sequence/beta", self.beta, "between 0 and 1")
+        check_settings(self, "/algorithm/sequence")
 
 
 @dataclass(frozen=True, slots=True)
 class Migration:
-    """Migration between islands: interval in generations, topology, number of migrants.
+    """Exchange between islands.
+
+    Attributes
+    ----------
+    every : int
+        Generations between two migrations.
+    topology : TopologyName
+        Which islands send to which.
+    migrants : int
+        Individuals that each island sends.
 
     Examples
     --------
@@ -66,21 +145,12 @@ class Migration:
     'one-way-ring'
     """
 
-    every: int = 25
+    every: Count = 25
     topology: TopologyName = "one-way-ring"
-    migrants: int = 2
+    migrants: Generation = 2
 
     def __post_init__(self) -> None:
-        _require_count(self.every, "migration/every")
-        _require(
-            self.topology in TOPOLOGIES, "migration/topology", self.topology, ", ".join(TOPOLOGIES)
-        )
-        _require(
-            0 <= self.migrants <= MAX_GENERATIONS,
-            "migration/migrants",
-            self.migrants,
-            f"0 to {MAX_GENERATIONS}",
-        )
+        check_settings(self, "/algorithm/migration")
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,32 +169,48 @@ class Stop:
 
     Only the adaptive sequence search makes restarts, so the paper's methods never stop by it.
 
+    Attributes
+    ----------
+    evaluations : int or None
+        Most simulations, never exceeded, of search, refinement, nearby minima, noise model,
+        standard errors, orders and posterior. At least one population. An individual whose fitness
+        is known counts too; checks of the finished estimate do not.
+    seconds : float or None
+        Most computing time, s. Least squares may end a tenth later (0.2 to 10 s), and a warning
+        lists what was left out. The result then depends on the machine.
+    rms : float or None
+        RMS error at which the search stops, in the output's unit.
+    settled : int or None
+        Restarts that must end at the best individual, and two more, and a third of all. None:
+        never stop for them.
+
     Examples
     --------
     >>> GeneticAlgorithm(stop=Stop(seconds=10)).stop.settled
     6
     """
 
-    evaluations: int | None = None
-    seconds: float | None = None
-    rms: float | None = None
-    settled: int | None = 6
+    evaluations: Annotated[int, Bounds(least=1, most=MAX_EVALUATIONS)] | None = None
+    seconds: Positive | None = None
+    rms: Positive | None = None
+    settled: Annotated[int, Bounds(least=1)] | None = 6
 
     def __post_init__(self) -> None:
-        for name in ("evaluations", "seconds", "rms", "settled"):
-            value = getattr(self, name)
-            _require(value is None or value > 0, f"stop/{name}", value, "positive")
-        _require(
-            self.evaluations is None or self.evaluations <= MAX_EVALUATIONS,
-            "stop/evaluations",
-            self.evaluations,
-            f"1 to {MAX_EVALUATIONS}",
-        )
+        check_settings(self, "/algorithm/stop")
 
 
 @dataclass(frozen=True, slots=True)
 class IslandChange:
-    """Settings of one island that differ from the archipelago's; None: the same.
+    """Settings in which one island differs from the others; None: as theirs.
+
+    Attributes
+    ----------
+    method : SearchMethod or None
+        Method of this island.
+    bits : int or None
+        Bits of each parameter in the chromosome.
+    mutation : MutationSchedule or None
+        Pairs of a generation and, from it on, the probability of one flipped bit in a child.
 
     Examples
     --------
@@ -133,10 +219,11 @@ class IslandChange:
     """
 
     method: SearchMethod | None = None
-    bits: int | None = None
+    bits: Bits | None = None
     mutation: MutationSchedule | None = None
 
     def __post_init__(self) -> None:
+        check_settings(self, "/algorithm/islands")
         if self.mutation is not None:
             _require_schedule(self.mutation, "islands")
 
@@ -147,17 +234,35 @@ class GeneticAlgorithm:
 
     Attributes
     ----------
+    method : SearchMethod
+        The paper's two methods as printed, or ours.
     population : int
         Individuals of all islands together, distributed as evenly as possible. The budget of
         evaluations does not depend on the number of islands.
-    mutation : tuple of (generation, rate)
-        Schedule: probability of one flipped bit in a child, from that generation on.
+    generations : int
+        Most generations.
+    bits : int
+        Bits of each parameter in the chromosome.
+    selection_rate : float
+        Share of an island that survives.
+    mutation : MutationSchedule
+        Pairs of a generation and, from it on, the probability of one flipped bit in a child. The
+        first generation is 0.
     stagnation : int
-        Generations without a better champion before the sequence search begins.
+        Generations without a better champion before the sequence search, or a restart, begins.
+    sequence : SequenceSearch
+        Settings of the sequence search.
     islands : int or tuple of IslandChange or None
-        None: 4 for ``improved``, 1 for the two methods of the paper, which has no islands.
+        Number of islands, or the settings of each. None: 4 for ``improved`` with 16 individuals or
+        more, else 1. The paper has no islands.
+    migration : Migration
+        Exchange between islands.
+    refine : bool
+        Whether least squares continues from the champions of ``improved``.
     safe_limit : float or None
-        Fitness above which an individual is invalid (section 3), in the output's unit.
+        RMS error above which a result is not valid (section 3), in the output's unit.
+    stop : Stop
+        What ends the search before the last generation, whichever comes first.
 
     Examples
     --------
@@ -168,40 +273,22 @@ class GeneticAlgorithm:
     """
 
     method: SearchMethod = "improved"
-    population: int = 50
-    generations: int = 400
-    bits: int = 24
-    selection_rate: float = 0.5
+    population: Annotated[int, Bounds(least=MIN_POPULATION)] = 50
+    generations: Count = 400
+    bits: Bits = 24
+    selection_rate: Share = 0.5
     mutation: MutationSchedule = ((0, 0.2), (50, 0.8))
-    stagnation: int = 30
+    stagnation: Count = 30
     sequence: SequenceSearch = field(default_factory=SequenceSearch)
     islands: int | tuple[IslandChange, ...] | None = None
     migration: Migration = field(default_factory=Migration)
     refine: bool = True
-    safe_limit: float | None = None
+    safe_limit: Positive | None = None
     stop: Stop = field(default_factory=Stop)
 
     def __post_init__(self) -> None:
-        _require(self.method in SEARCH_METHODS, "method", self.method, ", ".join(SEARCH_METHODS))
-        _require(
-            self.population >= MIN_POPULATION,
-            "population",
-            self.population,
-            f"{MIN_POPULATION} or more",
-        )
-        _require_count(self.generations, "generations")
-        _require(1 <= self.bits <= MAX_BITS, "bits", self.bits, f"1 to {MAX_BITS}")
-        _require(
-            0 < self.selection_rate < 1, "selection_rate", self.selection_rate, "between 0 and 1"
-        )
-        _require_count(self.stagnation, "stagnation")
+        check_settings(self, "/algorithm")
         _require_schedule(self.mutation, "mutation")
-        _require(
-            self.safe_limit is None or self.safe_limit > 0,
-            "safe_limit",
-            self.safe_limit,
-            "positive",
-        )
         _require(self.n_islands >= 1, "islands", self.islands, "1 or more")
         budget = self.stop.evaluations
         _require(
@@ -236,6 +323,15 @@ class Loss:
     squares with coloured residuals, the one that predicts left-out data better
     (`sysid.noise_models.noise_model_choice`), else ``white``.
 
+    Attributes
+    ----------
+    kind : LossKind
+        What is minimised; ``soft-l1`` limits the influence of outliers.
+    scale : float
+        Residual beyond which ``soft-l1`` grows linearly, in the output's unit.
+    noise_model : NoiseModel
+        Noise model of the estimates.
+
     Examples
     --------
     Outliers beyond about 0.5 of the output's unit count less:
@@ -245,17 +341,11 @@ class Loss:
     """
 
     kind: LossKind = "squares"
-    scale: float = 1.0
+    scale: Positive = 1.0
     noise_model: NoiseModel = "auto"
 
     def __post_init__(self) -> None:
-        if self.kind not in LOSS_KINDS:
-            raise InvalidSettings("/loss/kind", f"{self.kind!r} is not {_join(LOSS_KINDS)}")
-        if not self.scale > 0:
-            raise InvalidSettings("/loss/scale", f"{self.scale!r} is not a positive number")
-        if self.noise_model not in NOISE_MODELS:
-            detail = f"{self.noise_model!r} is not {_join(NOISE_MODELS)}"
-            raise InvalidSettings("/loss/noise_model", detail)
+        check_settings(self, "/loss")
         if self.noise_model == "ar1" and self.kind != "squares":
             raise InvalidSettings(
                 "/loss/noise_model",
@@ -274,11 +364,12 @@ class FitSettings:
     Attributes
     ----------
     parameters : mapping of str to mapping
-        Changed bounds, scales, fixed values or ties.
-    prediction : {"simulation", "one-step"}
-        Free run or one step ahead.
+        Changes of the model's parameters by name: bounds, scales, fixed values or ties.
+    prediction : PredictionKind
+        What is compared with the outputs: a free run from the model's own past, or predictions one
+        step ahead from the measured past.
     loss : Loss
-        Loss to minimise.
+        What is minimised.
     weights : mapping of str to float or sequence of float, or None
         Weight of each output, one number or one for each experiment. None: 1 for one output, else
         1 / its standard deviation; then the noise of each output in each experiment is estimated.
@@ -295,7 +386,7 @@ class FitSettings:
     prediction: PredictionKind = "simulation"
     loss: Loss = field(default_factory=Loss)
     weights: Weights | None = None
-    skip: int = 0
+    skip: Annotated[int, Bounds(least=0)] = 0
     scored_from: tuple[float, ...] | None = None
     deviations: tuple[tuple[float, ...], ...] | None = None
 
@@ -303,21 +394,72 @@ class FitSettings:
         object.__setattr__(self, "parameters", dict(self.parameters))
         if self.weights is not None:
             object.__setattr__(self, "weights", dict(self.weights))
-        if self.prediction not in PREDICTION_KINDS:
-            raise InvalidSettings(
-                "/prediction",
-                f"{self.prediction!r} is not {_join(list(map(repr, PREDICTION_KINDS)))}",
-            )
+        check_settings(self, "")
         if self.prediction == "one-step" and self.loss.noise_model == "ar1":
             raise InvalidSettings(
                 "/loss/noise_model",
                 f"{self.loss.noise_model} is for free runs; one-step predictions already "
                 "contain the noise",
             )
-        if self.skip < 0:
-            raise InvalidSettings(
-                "/skip", f"{self.skip!r} is not a number of samples; need 0 or more"
-            )
+
+
+def check_settings(settings: Any, pointer: str) -> None:
+    """Check that settings are among the choices and within the bounds of their declaration.
+
+    Raises
+    ------
+    InvalidSettings
+        With the pointer of the first field that is not; `pointer` is that of the settings.
+    """
+    for name, rule in _list_rules(settings.__class__):
+        value = getattr(settings, name)
+        if not rule.hold(value):
+            raise InvalidSettings(f"{pointer}/{name}", f"found {value!r}; need {rule}")
+
+
+@dataclass(frozen=True, slots=True)
+class _Rule:
+    """What a field may be: one of `choices`, or within `bounds`."""
+
+    choices: tuple[object, ...]
+    bounds: Bounds | None
+    may_be_none: bool
+
+    def hold(self, value: Any) -> bool:
+        if value is None:
+            return self.may_be_none
+        return value in self.choices if self.bounds is None else self.bounds.hold(value)
+
+    def __str__(self) -> str:
+        if self.bounds is not None:
+            return str(self.bounds)
+        *others, last = map(str, self.choices)
+        return f"{', '.join(others)} or {last}"
+
+
+@lru_cache
+def _list_rules(kind: type) -> tuple[tuple[str, _Rule], ...]:
+    """List the fields of settings that have choices or bounds."""
+    hints = get_type_hints(kind, include_extras=True)
+    rules = ((name, _read_rule(list_members(hint))) for name, hint in hints.items())
+    return tuple((name, rule) for name, rule in rules if rule.choices or rule.bounds)
+
+
+def _read_rule(members: Sequence[Any]) -> _Rule:
+    names = [get_args(member) for member in members if get_origin(member) is Literal]
+    bounds = filter(None, map(find_bounds, members))
+    return _Rule(tuple(chain(*names)), next(bounds, None), NoneType in members)
+
+
+def list_members(annotation: Any) -> tuple[Any, ...]:
+    """List the members of a union; any other type is the only member."""
+    return get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+
+
+def find_bounds(annotation: Any) -> Bounds | None:
+    """Find the bounds in the annotation of a number; None if it has none."""
+    extras = getattr(annotation, "__metadata__", ())
+    return next((extra for extra in extras if isinstance(extra, Bounds)), None)
 
 
 def _require(holds: bool, pointer: str, value: object, allowed: str) -> None:
@@ -325,22 +467,13 @@ def _require(holds: bool, pointer: str, value: object, allowed: str) -> None:
         raise InvalidSettings(f"/algorithm/{pointer}", f"found {value!r}; need {allowed}")
 
 
-def _require_count(value: int, pointer: str) -> None:
-    _require(1 <= value <= MAX_GENERATIONS, pointer, value, f"1 to {MAX_GENERATIONS}")
-
-
 def _require_schedule(schedule: MutationSchedule, pointer: str) -> None:
     generations = [generation for generation, _ in schedule]
     holds = (
-        bool(generations)
-        and generations[0] == 0
+        generations[:1] == [0]
         and generations[-1] <= MAX_GENERATIONS
         and generations == sorted(set(generations))
         and all(0 <= rate <= 1 for _, rate in schedule)
     )
     allowed = f"[generation, rate] pairs from generation 0 up to {MAX_GENERATIONS}, rates 0 to 1"
     _require(holds, pointer, schedule, allowed)
-
-
-def _join(names: Sequence[str]) -> str:
-    return f"{', '.join(names[:-1])} or {names[-1]}"

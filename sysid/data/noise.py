@@ -5,11 +5,12 @@ in (0, 1), so that ξ = (Σψ − N/2)/√(N/12) has mean 0, variance 1 and exce
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
 from sysid.core.errors import InvalidSettings
+from sysid.core.settings import Bounds, check_settings
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
 
@@ -24,9 +25,10 @@ class Noise:
     Attributes
     ----------
     sigma : float
-        Standard deviation, in the output's unit.
+        Standard deviation of the noise, in the unit of each output.
     seed : int
-    kind : {"gaussian", "uniform-sum"}
+        Seed of the noise; the same seed gives the same noise.
+    kind : NoiseKind
         ``uniform-sum``: Eq. 20 with N = `terms`.
     terms : int
         N ≥ 3 of Eq. 20.
@@ -39,10 +41,10 @@ class Noise:
     Noise(sigma=0.05, seed=1, kind='gaussian', terms=12, mean=0.0)
     """
 
-    sigma: float = 0.0
-    seed: int = 0
+    sigma: Annotated[float, Bounds(least=0)] = 0.0
+    seed: Annotated[int, Bounds(least=0)] = 0
     kind: NoiseKind = "gaussian"
-    terms: int = 12
+    terms: Annotated[int, Bounds(least=3)] = 12
     mean: float = 0.0
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -50,15 +52,9 @@ class Noise:
         return Noise, (self.sigma, self.seed, self.kind, self.terms, self.mean)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.sigma < np.inf:
-            raise InvalidSettings("/noise/sigma", f"found {self.sigma!r}; need 0 or more")
-        if self.seed < 0:
-            raise InvalidSettings("/noise/seed", f"found {self.seed!r}; need 0 or more")
-        if self.kind not in NOISE_KINDS:
-            names = " or ".join(map(repr, NOISE_KINDS))
-            raise InvalidSettings("/noise/kind", f"{self.kind!r} is not {names}")
-        if self.terms < 3:
-            raise InvalidSettings("/noise/terms", f"found {self.terms!r}; need 3 or more")
+        check_settings(self, "/noise")
+        if self.sigma == np.inf:
+            raise InvalidSettings("/noise/sigma", f"found {self.sigma!r}; need a finite number")
 
 
 def draw_noise(noise: Noise, n: int, stream: int = 0) -> FloatArray:

@@ -1,15 +1,30 @@
 """What is wrong with the values of a channel, or missing: the same words for files and tables."""
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from sysid.data.records import Channel
+from sysid.core.types import FloatArray
 
 
-def find_infinite_value(channels: "Iterable[Channel]") -> str | None:
+class TimedValues(Protocol):
+    """What is checked of a channel."""
+
+    @property
+    def name(self) -> str:
+        """Name of the channel, for messages."""
+
+    @property
+    def times(self) -> FloatArray:
+        """Times (s), shape (N,)."""
+
+    @property
+    def values(self) -> FloatArray:
+        """Values at these times, shape (N,)."""
+
+
+def find_infinite_value(channels: Iterable[TimedValues]) -> str | None:
     """Describe the first infinite value of channels; None if there is none."""
     for channel in channels:
         infinite = np.flatnonzero(np.isinf(channel.values))
@@ -21,7 +36,7 @@ def find_infinite_value(channels: "Iterable[Channel]") -> str | None:
     return None
 
 
-def describe_missing_values(channels: "Iterable[Channel]") -> list[str]:
+def describe_missing_values(channels: Iterable[TimedValues]) -> list[str]:
     """Describe the missing values of each channel that has some."""
     notes = []
     for channel in channels:

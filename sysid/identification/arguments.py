@@ -1,20 +1,17 @@
 """Read what a user gives to `identify`: recordings and tables, channels, changes of parameters."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import isfinite
-from numbers import Integral, Real
+from numbers import Real
 from os import PathLike
 from typing import Any, NamedTuple, TypeAlias
 
 from sysid.core.errors import InvalidRecord, InvalidSettings, join_pointer, suggest_name
-from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.data.holds import HOLDS, HoldSetting
-from sysid.data.noise import Noise
 from sysid.data.records import Channel, Record, Recording, to_channel
 from sysid.data.tables import (
     Labelled,
     describe_object,
-    describe_value,
     is_labelled,
     read_columns,
 )
@@ -54,7 +51,6 @@ def read_records(
     InvalidSettings
         If `channels` names a signal or channel that does not exist, or `hold` an input or a hold.
     """
-    check_kinds({"channels": channels, "hold": hold})
     holds = dict(hold or {})
     _check_holds(model, holds)
     each = data if isinstance(data, list | tuple) else [data]
@@ -148,52 +144,6 @@ def _describe_wrong_data(data: object) -> str:
     return f"{found} with named columns"
 
 
-def check_kinds(values: Mapping[str, object]) -> None:
-    """Check the kinds of the arguments of `identify` that are values of their own.
-
-    Raises
-    ------
-    InvalidSettings
-        If one is of another kind; the message says what it may be.
-    """
-    for name, value in values.items():
-        kinds, need = _KINDS[name]
-        is_left_out = value is None and name not in _NEEDED
-        is_flag = isinstance(value, bool) and bool not in kinds
-        if not is_left_out and (is_flag or not isinstance(value, kinds)):
-            found = f"found {describe_value(value)}; need {need}"
-            if name == "settings" and _is_signal(value):
-                found += ". To identify from two series, join them: Record(inputs, outputs)"
-            raise InvalidSettings(f"/{name}", found)
-
-
-def _is_signal(value: object) -> bool:
-    return isinstance(value, Channel | list | tuple) or hasattr(value, "shape")
-
-
-_KINDS: Mapping[str, tuple[tuple[Any, ...], str]] = {
-    "channels": ((Mapping,), "a mapping of signals to channels, such as {'u': 'P1'}"),
-    "hold": ((Mapping,), "a mapping of inputs to holds, such as {'u': 'zero'}"),
-    "parameters": ((Mapping,), "a mapping of parameters to changes, such as {'L': (0, 2)}"),
-    "settings": ((GeneticAlgorithm,), "GeneticAlgorithm(…), or None for its defaults"),
-    "loss": ((Loss,), "Loss(…), such as Loss('soft-l1', scale=0.5)"),
-    "noise": ((Noise,), "Noise(…), such as Noise(sigma=0.1)"),
-    "seed": ((Integral,), "a whole number"),
-    "skip": ((Integral,), "a number of samples"),
-    "weights": (
-        (Mapping,),
-        "a mapping of outputs to numbers or lists of them",
-    ),
-    "warm": ((Mapping,), "a mapping of parameters to values"),
-    "validation_fraction": ((Real,), "a number between 0 and 1"),
-    "posterior": ((bool,), "True or False"),
-    "compare_orders": ((bool,), "True or False"),
-    "progress": ((Callable,), "a function of the run's state"),
-}
-_NEEDED = ("seed", "skip", "posterior", "compare_orders")
-"""Arguments that None does not leave out."""
-
-
 def check_warm(warm: Mapping[str, float] | None, known: Sequence[str]) -> None:
     """Check the values that the search starts from.
 
@@ -223,7 +173,6 @@ def read_changes(
     """
     if parameters is None:
         return {}
-    check_kinds({"parameters": parameters})
     return {name: _read_change(name, change) for name, change in parameters.items()}
 
 

@@ -1,21 +1,18 @@
 """Identify a model from records, in this process."""
 
-from __future__ import annotations  # the help of `identify` shows `Data`, not all that it is
+from __future__ import annotations  # as in `request`, whose fields are in the signature
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from sysid.core.distributions import load_in_background
-from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, PredictionKind, Weights
+from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss
 from sysid.core.text import rewrite_settings
-from sysid.data.holds import HoldSetting
-from sysid.data.noise import Noise
 from sysid.data.records import Record
 from sysid.diagnosis.warnings import warn_constant_outputs
 from sysid.identification.arguments import (
-    Change,
     Data,
-    check_kinds,
+    ReadRecords,
     check_warm,
     read_changes,
     read_records,
@@ -24,39 +21,21 @@ from sysid.identification.arguments import (
 from sysid.identification.conclude import conclude_run
 from sysid.identification.fit_problems import build_problems, prepare_records
 from sysid.identification.fitted_data import collect_fitted_data
+from sysid.identification.options import RunOptions
+from sysid.identification.request import IdentificationRequest, accept_fields
 from sysid.identification.run import advance_run, begin_run, is_finished
 from sysid.islands.state import RunState
-from sysid.models.catalogue.load import ModelSource, resolve_model
+from sysid.models.catalogue.load import resolve_model
 from sysid.models.delays import check_unused_settings
 from sysid.models.model import Model
 from sysid.models.units import check_signal_units
 from sysid.results.result import Identification
-from sysid.simulation.problem import Problem
 
 _PROGRESS_SECONDS = 0.25
 
 
-def identify(
-    model: ModelSource,
-    records: Data | Sequence[Data],
-    settings: GeneticAlgorithm | None = None,
-    *,
-    channels: Mapping[str, str] | None = None,
-    hold: Mapping[str, HoldSetting] | None = None,
-    seed: int = 1,
-    parameters: Mapping[str, Change] | None = None,
-    prediction: PredictionKind = "simulation",
-    loss: Loss | None = None,
-    weights: Weights | None = None,
-    skip: int = 0,
-    validation: Data | Sequence[Data] | None = None,
-    validation_fraction: float | None = None,
-    noise: Noise | None = None,
-    warm: Mapping[str, float] | None = None,
-    posterior: bool = False,
-    compare_orders: bool = True,
-    progress: Callable[[RunState], None] | None = None,
-) -> Identification:
+@accept_fields(IdentificationRequest)
+def identify(request: IdentificationRequest) -> Identification:
     """Estimate the free parameters of a model, including its unknown time lags.
 
     The result has each estimate with its standard error, its unit and a status, tests of the
@@ -138,40 +117,23 @@ def identify(
     >>> found = identify("fopdt", {"t": t, "u": u, "y": y})
     >>> round(found["L"].value, 2)
     0.5
-    """
-    check_kinds(
-        {
-            "settings": settings,
-            "loss": loss,
-            "noise": noise,
-            "seed": seed,
-            "skip": skip,
-            "weights": weights,
-            "warm": warm,
-            "validation_fraction": validation_fraction,
-            "posterior": posterior,
-            "compare_orders": compare_orders,
-            "progress": progress,
-        }
-    )
-    algorithm = settings or GeneticAlgorithm()
-    model = resolve_model(model)
-    read = read_records(model, records, channels, hold)
+    """  # noqa: DOC102 - the decorator gives the function these parameters
+    model = resolve_model(request.model)
+    read = _read_data(model, request, request.records)
+    loss = request.loss or Loss()
+    changes = read_changes(request.parameters)
     found = identify_records(
         model,
         read.records,
-        algorithm,
-        FitSettings(read_changes(parameters), prediction, loss or Loss(), weights, skip),
-        seed=seed,
+        request.settings or GeneticAlgorithm(),
+        FitSettings(changes, request.prediction, loss, request.weights, request.skip),
+        request,
         validation=(
-            None if validation is None else read_records(model, validation, channels, hold).records
+            None
+            if request.validation is None
+            else _read_data(model, request, request.validation).records
         ),
-        validation_fraction=validation_fraction,
-        noise=noise,
-        warm=warm,
-        posterior=posterior,
-        compare_orders=compare_orders,
-        progress=progress,
+        progress=request.progress,
     )
     assert found.data is not None
     notes = (rewrite_settings(note, write_setting) for note in found.warnings)
@@ -179,19 +141,20 @@ def identify(
     return replace(found, warnings=(*read.notes, *notes), data=data)
 
 
+def _read_data(
+    model: Model, request: IdentificationRequest, data: Data | Sequence[Data]
+) -> ReadRecords:
+    return read_records(model, data, request.channels, request.hold)
+
+
 def identify_records(
     model: Model,
     records: Sequence[Record],
     algorithm: GeneticAlgorithm,
     fit: FitSettings,
+    options: RunOptions,
     *,
-    seed: int,
     validation: Sequence[Record] | None = None,
-    validation_fraction: float | None = None,
-    noise: Noise | None = None,
-    warm: Mapping[str, float] | None = None,
-    posterior: bool = False,
-    compare_orders: bool = True,
     progress: Callable[[RunState], None] | None = None,
     tell: Callable[[Sequence[str]], None] | None = None,
 ) -> Identification:
@@ -206,33 +169,23 @@ def identify_records(
     """
     check_unused_settings(model, len(records), fit.parameters, fit.weights)
     check_signal_units(model, (*records, *(validation or ())))
-    prepared = prepare_records(records, validation, validation_fraction, noise)
+    prepared = prepare_records(records, validation, options.validation_fraction, options.noise)
     problem, validation_problem = problems = build_problems(model, prepared, fit)
-    check_warm(warm, [parameter.name for parameter in problem.all_parameters])
+    check_warm(options.warm, [parameter.name for parameter in problem.all_parameters])
     if tell is not None:
         tell(warn_constant_outputs(problem))
     load_in_background()  # the conclusion needs them
-    found = conclude_run(
-        problem,
-        algorithm,
-        _run_search(problem, algorithm, seed, warm, progress),
-        validation_problem,
-        posterior=posterior,
-        orders=compare_orders,
-    )
-    return replace(found, data=collect_fitted_data(model, prepared, problems, found))
-
-
-def _run_search(
-    problem: Problem,
-    algorithm: GeneticAlgorithm,
-    seed: int,
-    warm: Mapping[str, float] | None,
-    progress: Callable[[RunState], None] | None,
-) -> RunState:
-    state = begin_run(problem, algorithm, seed, warm)
+    state = begin_run(problem, algorithm, options.seed, options.warm)
     while not is_finished(algorithm, state):
         state = advance_run(problem, algorithm, state, _PROGRESS_SECONDS)
         if progress is not None:
             progress(state)
-    return state
+    found = conclude_run(
+        problem,
+        algorithm,
+        state,
+        validation_problem,
+        posterior=options.posterior,
+        orders=options.compare_orders,
+    )
+    return replace(found, data=collect_fitted_data(model, prepared, problems, found))

@@ -286,10 +286,10 @@ def test_a_chain_of_runs_that_fail_asks_the_database_for_none_of_them(place, mon
     def refused(*_):
         raise AssertionError("an earlier attempt is looked for")
 
-    def broken(body):
+    def broken(body, **_):
         raise InvalidSettings("/algorithm", "as told")
 
     monkeypatch.setattr(WarmStarts, "_read_last_success", refused)
-    monkeypatch.setattr(job_parts, "to_algorithm", broken)
+    monkeypatch.setattr(job_parts, "read_run_settings", broken)
     runs, _ = carried_out(place, **chained({"path": "/seed", "range": [0, 50]}))
     assert {one.state for one in runs} == {JobState.FAILED}

@@ -1,5 +1,6 @@
 """The table of all settings, from the settings: ``python -m tests.documents.settings``."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from service.core.settings import Settings
@@ -12,15 +13,21 @@ UNITS = ((2**30, "GiB"), (2**20, "MiB"))
 
 def write_page() -> str:
     """Write the page with the table of today."""
-    before, _, rest = PAGE.read_text().partition(BEGIN)
-    _, _, after = rest.partition(END)
     rows = [
         f"| `LAGID_{name.upper()}` | {format_default(name, field.default)} "
         f"| {' '.join((field.description or '').split())} |\n"
         for name, field in Settings.model_fields.items()
     ]
-    table = "".join(["| variable | default | meaning |\n|---|---|---|\n", *rows])
-    return before + BEGIN + table + END + after
+    return replace_table(
+        PAGE.read_text(), ["| variable | default | meaning |\n|---|---|---|\n", *rows]
+    )
+
+
+def replace_table(page: str, lines: Sequence[str]) -> str:
+    """Replace the lines between the two marks of a page."""
+    before, _, rest = page.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    return "".join([before, BEGIN, *lines, END, after])
 
 
 def format_default(name: str, value: Any) -> str:

@@ -1,8 +1,8 @@
 // The form of a re-identification: recordings with labels, and one POST to /v1/recipes/reidentify.
 
 import { address } from './live.js';
-import { parseNumber, readOverrides, withFaults, onSubmit } from './fields.js';
-import { readAlgorithm, readChannels, loadChosenModel, drawChannels, parseNumbers } from './recipes.js';
+import { parseNumber, readAlgorithm, readOverrides, withFaults, onSubmit } from './fields.js';
+import { readChannels, loadChosenModel, drawChannels, parseNumbers } from './recipes.js';
 
 const form = document.getElementById('batch-form');
 const field = (name) => form.elements.namedItem(name);

@@ -79,6 +79,31 @@ export function parseNumber(text) {
   return typed === '' ? null : Number.isNaN(number) ? typed : number;
 }
 
+/** List the fields of the search's settings, each with the names on the way to its setting. */
+const listSearchFields = (form) =>
+  [...form.querySelectorAll('[data-pointer^="/algorithm/"]')].map((input) => [input, input.dataset.pointer.split('/').slice(2)]);
+
+/** Read the settings of the search over those given. An empty field stands for the default; a list is kept. */
+export function readAlgorithm(form, given = {}) {
+  const algorithm = structuredClone(given);
+  for (const [input, path] of listSearchFields(form)) {
+    const name = path.pop();
+    const group = path.reduce((node, part) => (node[part] ??= {}), algorithm);
+    const value = input instanceof HTMLSelectElement ? input.value : parseNumber(input.value);
+    if (value !== null) group[name] = value;
+    else if (!Array.isArray(group[name])) delete group[name];
+  }
+  return algorithm;
+}
+
+/** Show settings of the search in their fields. A field without a number or a name stays as it is. */
+export function fillAlgorithm(form, algorithm = {}) {
+  for (const [input, path] of listSearchFields(form)) {
+    const value = path.reduce((node, part) => node?.[part], algorithm);
+    if (['number', 'string'].includes(typeof value)) input.value = value;
+  }
+}
+
 /** Read what differs from the model, as the job body has it. */
 export function readOverrides() {
   const changes = structuredClone(hiddenChanges);

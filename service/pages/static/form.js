@@ -2,7 +2,7 @@
 
 import { Problem, address, ask, makeElement, keepLatest, post } from './live.js';
 import * as forms from './fields.js';
-import { clearFaults, fillTable, parseNumber, readOverrides, showProposals } from './fields.js';
+import { clearFaults, fillAlgorithm, fillTable, parseNumber, readAlgorithm, readOverrides, showProposals } from './fields.js';
 import { forgetPreview, listValidationSteps, previewDataset, readSteps } from './preview.js';
 import { describeModel } from './equations.js';
 
@@ -44,10 +44,7 @@ async function fillFrom(job) {
   const set = (key, value) => value !== undefined && value !== null && (field(key).value = value);
   state.extra = request;
   if (request.name) set('name', name); // the service names the other jobs after model and data
-  const algorithm = request.algorithm ?? {};
-  for (const key of ['method', 'population', 'generations']) set(key, algorithm[key]);
-  if (Number.isInteger(algorithm.islands)) set('islands', algorithm.islands);
-  set('evaluations', algorithm.stop?.evaluations);
+  fillAlgorithm(form, request.algorithm);
   for (const key of ['seed', 'prediction']) set(key, request[key]);
   set('loss', request.loss?.kind);
   set('noise_model', request.loss?.noise_model);
@@ -257,10 +254,6 @@ const getOwnModel = () => (field('equations').value === state.cloned?.text ? sta
 
 function buildBody() {
   const { sweep, ...extra } = state.extra;
-  const algorithm = { ...extra.algorithm, method: field('method').value };
-  for (const key of ['population', 'generations']) if (readNumber(key) !== null) algorithm[key] = readNumber(key);
-  if (!Array.isArray(extra.algorithm?.islands) || readNumber('islands') !== null) algorithm.islands = readNumber('islands');
-  algorithm.stop = { ...extra.algorithm?.stop, evaluations: readNumber('evaluations') };
   const validation = field('validation').value;
   const datasets = extra.datasets?.[0] === field('dataset').value ? extra.datasets : [field('dataset').value];
   return {
@@ -275,7 +268,7 @@ function buildBody() {
     parameters: readOverrides(),
     prediction: field('prediction').value,
     loss: { ...extra.loss, kind: field('loss').value, noise_model: field('noise_model').value },
-    algorithm,
+    algorithm: readAlgorithm(form, extra.algorithm),
     seed: readNumber('seed') ?? 1,
     posterior: field('posterior').value === 'sampled',
   };

@@ -54,14 +54,3 @@ export function parseNumbers(text) {
   if (!text.includes(';') && !text.includes('.') && /\d,\d/.test(text)) return [text.trim()];
   return text.split(text.includes(';') ? /[;\s]+/ : /[,\s]+/).filter(Boolean).map(parseNumber);
 }
-
-/** Read the settings of the search that were typed. */
-export function readAlgorithm(form) {
-  const settings = {};
-  for (const key of ['population', 'generations']) {
-    const value = parseNumber(form.elements[key].value);
-    if (value !== null) settings[key] = value;
-  }
-  const evaluations = parseNumber(form.elements.evaluations.value);
-  return evaluations === null ? settings : { ...settings, stop: { evaluations } };
-}

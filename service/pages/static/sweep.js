@@ -1,8 +1,8 @@
 // The form of a noise sweep: how many runs it makes, and one POST to /v1/recipes/noise-sweep.
 
 import { address, makeElement } from './live.js';
-import { parseNumber, readOverrides, withFaults, onSubmit } from './fields.js';
-import { readAlgorithm, readChannels, loadChosenModel, drawChannels, listInputs, parseNumbers } from './recipes.js';
+import { parseNumber, readAlgorithm, readOverrides, withFaults, onSubmit } from './fields.js';
+import { readChannels, loadChosenModel, drawChannels, listInputs, parseNumbers } from './recipes.js';
 
 const form = document.getElementById('sweep-form');
 const field = (name) => form.elements.namedItem(name);

@@ -96,7 +96,7 @@ def test_every_reading_gives_bodies_that_the_service_takes(example: oscillators.
     for reading in oscillators.list_readings(example):
         SimulateIn.model_validate(oscillators.record_body(example, reading))
         body = JobIn.model_validate(oscillators.job_body(example, reading, "ds_1"))
-        assert body.algorithm.population == 50
+        assert body.to_normal_form()["algorithm"]["population"] == 50
         assert set(example.true) == set(example.columns.simple) == set(example.columns.proposed)
 
 

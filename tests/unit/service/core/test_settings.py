@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from service.core.errors import Misconfigured
 from service.core.settings import Settings, is_loopback
 from service.jobs.schemas import JobIn
-from service.jobs.to_core import to_algorithm, to_loss
+from service.jobs.to_core import RunSettings, read_run_settings
 from service.pages.choices import DEFAULTS, NAMES, TEXTS, list_choices
 from service.storage.sessions import Database
 from sysid.core.errors import InvalidSettings
@@ -25,13 +25,15 @@ from sysid.core.settings import (
     SEARCH_METHODS,
     SEQUENCE_KINDS,
     TOPOLOGIES,
+    FitSettings,
     GeneticAlgorithm,
     IslandChange,
-    Loss,
     Migration,
     Stop,
 )
+from sysid.data.noise import Noise
 from sysid.data.records import HOLDS
+from sysid.identification.options import RunOptions
 
 
 @pytest.mark.parametrize(
@@ -54,10 +56,14 @@ def test_a_number_that_the_compiled_search_cannot_count_is_refused(
     assert refused.value.pointer == pointer
 
 
+def settings(**body: Any) -> RunSettings:
+    """Settings of the core that a job's body gives."""
+    job = JobIn.model_validate({"model": "m", "datasets": ["d"], **body})
+    return read_run_settings(job.to_normal_form(), in_sweep=False)
+
+
 def test_the_defaults_of_the_job_body_are_those_of_the_core() -> None:
-    document = JobIn.model_validate({"model": "m", "datasets": ["d"]}).to_normal_form()
-    assert to_algorithm(document["algorithm"]) == GeneticAlgorithm()
-    assert to_loss(document["loss"]) == Loss()
+    assert settings() == (GeneticAlgorithm(), FitSettings(), RunOptions(noise=Noise()))
 
 
 def test_the_wire_types_take_every_name_of_the_core_and_its_bounds() -> None:
@@ -71,9 +77,7 @@ def test_the_wire_types_take_every_name_of_the_core_and_its_bounds() -> None:
     every += [{"hold": {"u": name}} for name in HOLDS]
     every += [{"algorithm": {"population": MIN_POPULATION}}, {"algorithm": {"bits": MAX_BITS}}]
     for body in every:
-        document = JobIn.model_validate({"model": "m", "datasets": ["d"], **body}).to_normal_form()
-        assert to_algorithm(document["algorithm"])
-        assert to_loss(document["loss"])
+        assert settings(**body)
     for field, value in (("population", MIN_POPULATION - 1), ("bits", MAX_BITS + 1)):
         body = {"model": "m", "datasets": ["d"], "algorithm": {field: value}}
         with pytest.raises(ValidationError, match=field):
@@ -89,8 +93,7 @@ def test_the_form_has_a_choice_for_every_name_and_no_text_without_a_name() -> No
 
 def test_changes_of_single_islands_reach_the_core() -> None:
     algorithm = {"islands": [{"method": "simple"}, {"bits": 12, "mutation": [[0, 0.5]]}]}
-    body = JobIn.model_validate({"model": "m", "datasets": ["d"], "algorithm": algorithm})
-    assert to_algorithm(body.to_normal_form()["algorithm"]).islands == (
+    assert settings(algorithm=algorithm).algorithm.islands == (
         IslandChange(method="simple"),
         IslandChange(bits=12, mutation=((0, 0.5),)),
     )

@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from sysid.core.settings import SEARCH_METHODS, TOPOLOGIES
 from sysid.data.derivations import STEPS, derive_recording
 from sysid.data.noise import NOISE_KINDS
 from sysid.data.records import HOLDS, Channel, Recording, Segment
+from tests.documents.job import FIELDS, PAGE, write_page
 from tests.repository import ROOT
 
 PAGES = [(ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("job.md", "derive.md")]
@@ -39,27 +39,8 @@ def rows(page: str) -> dict[str, list[str]]:
 ROWS, STEP_ROWS = map(rows, PAGES)
 
 
-def within(field: Any) -> Iterator[str]:
-    """Names of the object types that a field of the schema may hold, on its own or in a list."""
-    if isinstance(field, dict):
-        if "$ref" in field:
-            yield field["$ref"].rpartition("/")[2]
-        for key in ("anyOf", "items", "additionalProperties"):
-            inside = field.get(key, [])
-            for one in inside if isinstance(inside, list) else [inside]:
-                yield from within(one)
-
-
-def fields(schema: dict[str, Any], kind: dict[str, Any], path: str = "") -> Iterator[Any]:
-    """Path and schema of every field of a body."""
-    for name, field in kind["properties"].items():
-        yield path + name, field
-        for inner in within(field):
-            yield from fields(schema, schema["$defs"][inner], f"{path}{name}.")
-
-
-SCHEMA = JobIn.model_json_schema()
-FIELDS = dict(fields(SCHEMA, SCHEMA))
+def test_the_table_of_the_search_is_that_of_its_settings() -> None:
+    assert PAGE.read_text(encoding="utf-8") == write_page(), "`make docs` writes it anew"
 
 
 @pytest.mark.parametrize("path", FIELDS)
