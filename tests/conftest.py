@@ -23,6 +23,7 @@ pytest_plugins = [
     "tests.stores",
     "tests.cluster",
     "tests.compiling",
+    "tests.endless_children",
     "tests.needs",
     "tests.standing",
 ]
