@@ -25,6 +25,7 @@ pytest_plugins = [
     "tests.compiling",
     "tests.endless_children",
     "tests.needs",
+    "tests.patience",
     "tests.standing",
 ]
 
