@@ -200,10 +200,20 @@ def split_setting_path(change: str) -> list[str]:
         fail_usage(f"--set {change}: need path=value, such as algorithm.population=100")
     parts = [part for part in path.replace("/", ".").split(".") if part]
     if parts[:1] == ["initial"] and len(parts) > 1:
-        name, *fields = parts[1:]
-        wanted = ".".join(["parameters", f"{name.removesuffix('(0)')}(0)", *(fields or ["fixed"])])
-        fail_usage(f"--set {change}: a start value is a parameter: --set '{wanted}={value}'")
+        fail_usage(f"--set {change}: {_advise_start(parts[1], parts[2:], value)}")
     return parts
+
+
+def _advise_start(state: str, fields: Sequence[str], value: str) -> str:
+    """Return what sets the start of a state: its parameter, or the document of the model."""
+    document = "the model's document, which lagid models show prints"
+    given = parse_yaml(value.encode())
+    if not fields and not isinstance(given, int | float | Mapping):
+        return f"how a state starts is said by {document}"
+    if not fields and not isinstance(given, Mapping):
+        fields = ["fixed"]
+    wanted = ".".join(["parameters", f"{state.removesuffix('(0)')}(0)", *fields])
+    return f"a start value is a parameter: --set '{wanted}={value}'; its bounds are in {document}"
 
 
 def apply_setting(body: dict[str, Any], change: str) -> None:
@@ -520,9 +530,15 @@ class FieldOrigins:
         """Rewrite a note so that it names options instead of job fields."""
         return rewrite_settings(note, self._format_setting)
 
-    def _format_setting(self, part: str, name: str, value: str) -> str:
-        origin = self.locate(join_pointer(part, name))
-        return f"{origin}{'=' if origin.startswith('--set ') else ' '}{value}"
+    def _format_setting(self, field: str, entries: Mapping[str, str]) -> str:
+        origins = {
+            self.locate(join_pointer(*filter(None, (field, name)))): value
+            for name, value in entries.items()
+        }
+        return " ".join(
+            f"{origin}{'=' if origin.startswith('--set ') else ' '}{value}"
+            for origin, value in origins.items()
+        )
 
     def _describe_fault(self, fault: FieldError) -> str:
         origin = self.locate(fault.pointer) if fault.pointer else self.file

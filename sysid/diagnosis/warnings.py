@@ -158,7 +158,7 @@ def _warn_no_prediction(problem: Problem) -> list[str]:
     names = ", ".join(output.name for output in problem.model.outputs)
     return [
         f"no output ({names}) is a state by itself, so one-step predictions equal the free run. "
-        "To start each step from the measured output, write it as a state: outputs: {y: x}."
+        "To start each step from the measured output, make it a state in the model's document."
     ]
 
 
