@@ -196,6 +196,7 @@ def _compute_moments(
     offset = 60 * numbers["zone_hour"] + numbers["zone_minute"]
     minutes = 60 * hour + minute + np.where(numbers["is_west"], offset, -offset)
     ticks = (60 * minutes + second) * 1_000_000_000 + numbers["fraction"]
-    moments = days.astype("datetime64[ns]") + np.where(is_valid, ticks, 0).astype("timedelta64[ns]")
+    shift = np.where(is_valid, ticks, 0).astype("timedelta64[ns]")
+    moments: NDArray[np.datetime64] = days.astype("datetime64[ns]") + shift
     moments[~is_valid] = np.datetime64("NaT")
     return moments
