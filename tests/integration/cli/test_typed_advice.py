@@ -46,8 +46,9 @@ def list_texts(path: Path) -> Iterator[str]:
 def read_text(node: ast.AST) -> str:
     if isinstance(node, ast.JoinedStr):
         return "".join(read_text(part) or OPEN for part in node.values)
-    is_text = isinstance(node, ast.Constant) and isinstance(node.value, str)
-    return node.value if is_text else ""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    return ""
 
 
 @cache
