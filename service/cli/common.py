@@ -206,14 +206,17 @@ def split_setting_path(change: str) -> list[str]:
 
 def _advise_start(state: str, fields: Sequence[str], value: str) -> str:
     """Return what sets the start of a state: its parameter, or the document of the model."""
-    document = "the model's document, which lagid models show prints"
+    document = "write it into the model's document, which lagid models show prints"
     given = parse_yaml(value.encode())
     if not fields and not isinstance(given, int | float | Mapping):
-        return f"how a state starts is said by {document}"
+        return f"no option sets how a state starts; {document}"
     if not fields and not isinstance(given, Mapping):
         fields = ["fixed"]
     wanted = ".".join(["parameters", f"{state.removesuffix('(0)')}(0)", *fields])
-    return f"a start value is a parameter: --set '{wanted}={value}'; its bounds are in {document}"
+    return (
+        f"a start value that is searched is a parameter: --set '{wanted}={value}'. If the model "
+        f"does not search it, {document}"
+    )
 
 
 def apply_setting(body: dict[str, Any], change: str) -> None:
