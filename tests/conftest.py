@@ -23,7 +23,9 @@ pytest_plugins = [
     "tests.stores",
     "tests.cluster",
     "tests.compiling",
+    "tests.endless_children",
     "tests.needs",
+    "tests.patience",
     "tests.standing",
 ]
 

@@ -142,6 +142,7 @@ Force = Annotated[
     typer.Option("--force", "-f", help="Overwrite what is there.", rich_help_panel=OUTPUT_PANEL),
 ]
 
+
 def show_examples(*commands: str) -> str:
     """Return the end of a command's help: examples that can be copied."""
     lines = (f"[dim]$[/] {command.replace('[', chr(92) + '[')}" for command in commands)
@@ -236,10 +237,23 @@ def split_setting_path(change: str) -> list[str]:
         fail_usage(f"--set {change}: need path=value, such as algorithm.population=100")
     parts = [part for part in path.replace("/", ".").split(".") if part]
     if parts[:1] == ["initial"] and len(parts) > 1:
-        name, *fields = parts[1:]
-        wanted = ".".join(["parameters", f"{name.removesuffix('(0)')}(0)", *(fields or ["fixed"])])
-        fail_usage(f"--set {change}: a start value is a parameter: --set '{wanted}={value}'")
+        fail_usage(f"--set {change}: {_advise_start(parts[1], parts[2:], value)}")
     return parts
+
+
+def _advise_start(state: str, fields: Sequence[str], value: str) -> str:
+    """Return what sets the start of a state: its parameter, or the document of the model."""
+    document = "write it into the model's document, which lagid models show prints"
+    given = parse_yaml(value.encode())
+    if not fields and not isinstance(given, int | float | Mapping):
+        return f"no option sets how a state starts; {document}"
+    if not fields and not isinstance(given, Mapping):
+        fields = ["fixed"]
+    wanted = ".".join(["parameters", f"{state.removesuffix('(0)')}(0)", *fields])
+    return (
+        f"a start value that is searched is a parameter: --set '{wanted}={value}'. If the model "
+        f"does not search it, {document}"
+    )
 
 
 def apply_setting(body: dict[str, Any], change: str) -> None:
@@ -556,9 +570,15 @@ class FieldOrigins:
         """Rewrite a note so that it names options instead of job fields."""
         return rewrite_settings(note, self._format_setting)
 
-    def _format_setting(self, part: str, name: str, value: str) -> str:
-        origin = self.locate(join_pointer(part, name))
-        return f"{origin}{'=' if origin.startswith('--set ') else ' '}{value}"
+    def _format_setting(self, field: str, entries: Mapping[str, str]) -> str:
+        origins = {
+            self.locate(join_pointer(*filter(None, (field, name)))): value
+            for name, value in entries.items()
+        }
+        return " ".join(
+            f"{origin}{'=' if origin.startswith('--set ') else ' '}{value}"
+            for origin, value in origins.items()
+        )
 
     def _describe_fault(self, fault: FieldError) -> str:
         origin = self.locate(fault.pointer) if fault.pointer else self.file

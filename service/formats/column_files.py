@@ -185,9 +185,13 @@ def _find_period(arrays: Mapping[str, Any], notes: list[str]) -> float | None:
 
 
 def read_parquet(path: Path, options: ReadOptions, notes: list[str]) -> Table:
-    """Read the columns of a Parquet file."""
-    import polars as pl
-
+    """Read the columns of a Parquet file, by the library of the extra `parquet`."""
+    try:
+        import polars as pl
+    except ModuleNotFoundError:
+        raise UnreadableFile(
+            "a Parquet file needs polars, not installed here: pip install 'lagid[parquet]'"
+        ) from None
     try:
         scan = pl.scan_parquet(path, glob=False)
         names = scan.collect_schema().names()

@@ -25,17 +25,12 @@ from service.formats.text_files import open_text
 from sysid.data.records import Channel, Recording
 
 
-class HoldsStamps(Exception):
-    """The times of a text are date stamps, and its reader does not accept these."""
-
-
 def read_csv(
     source: Path | str | bytes,
     *,
     sample_time: float | None = None,
     segments: Sequence[str] = (),
     limits: UploadLimits = DEFAULT_LIMITS,
-    accepts_stamps: bool = True,
 ) -> tuple[Recording, tuple[str, ...]]:
     """Read a text file of columns.
 
@@ -50,8 +45,6 @@ def read_csv(
         the time may restart with each segment. Segments follow each other on one axis.
     limits : UploadLimits
         Those of an MCAP file hold here too: signals, and rows as messages.
-    accepts_stamps : bool
-        Whether the times may be date stamps, which a large library parses.
 
     Returns
     -------
@@ -63,14 +56,10 @@ def read_csv(
     ------
     UnreadableFile
         If the file cannot be used. The error has the row of the file, from 1, and the column.
-    HoldsStamps
-        If the times are date stamps, and these are not accepted.
     """
     notes: list[str] = []
     with open_text(source, limits, notes) as lines:
         layout, first = detect_layout(lines, segments, sample_time, limits.channels)
-        if layout.has_stamps and not accepts_stamps:
-            raise HoldsStamps
         notes += layout.notes
         table = read_lines(chain(first, lines), layout, notes, limits.messages)
     return build_recording(table, notes), tuple(notes)

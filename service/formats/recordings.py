@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Protocol, runtime_checkable
@@ -111,19 +110,12 @@ _NO_FILE = " A table is a recording already: give it to identify, or to Recordin
 def _read_file(path: Path, options: ReadOptions) -> tuple[Recording, tuple[str, ...]]:
     if path.is_dir():
         raise UnreadableFile("it is a folder; need a file")
-    from service.formats.csv_recordings import HoldsStamps, read_csv
+    from service.formats.csv_recordings import read_csv
 
     sample_time, segments, limits = options.sample_time, options.segments, options.limits
     is_packed = read_head(path).startswith(GZIP_MAGIC)  # unpacking needs limits
     if detect_kind(path, path.suffix) == "csv" and not is_packed:
-        with suppress(HoldsStamps):
-            return read_csv(
-                path,
-                sample_time=sample_time,
-                segments=segments,
-                limits=limits,
-                accepts_stamps=False,
-            )
+        return read_csv(path, sample_time=sample_time, segments=segments, limits=limits)
     from service.formats.sandbox import read_untrusted
 
     upload = read_untrusted(

@@ -88,14 +88,6 @@ class TableLayout:
     sample_time: float | None = None
     notes: tuple[str, ...] = ()
 
-    @property
-    def has_stamps(self) -> bool:
-        """Whether the times are dates."""
-        return any(
-            column.role in ("time", "date") and column.kind in ("stamp", "date")
-            for column in self.columns
-        )
-
 
 class _Row(NamedTuple):
     """A row of fields, and its place among the rows of the file, from 0."""

@@ -2,13 +2,14 @@
 
 import re
 from datetime import UTC
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.formats.advice import GIVE_PERIOD
-from service.formats.cells import CLOCK_TIME, DATE_ONLY, MISSING, STAMP
+from service.formats.cells import CLOCK_TIME, MISSING, STAMP
+from service.formats.stamp_numbers import DAY_FIRST, find_form, parse_form
 from service.formats.table_columns import (
     ColumnValues,
     build_missing_time_error,
@@ -19,10 +20,6 @@ from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import measure_sampling
 from sysid.data.table_rules import TimeAxis, count_from_first, format_moment
 
-if TYPE_CHECKING:
-    import polars as pl
-
-_ZONE_FORM: Final = "%#z"
 _DAY_SECONDS: Final = 86_400.0
 
 
@@ -98,69 +95,18 @@ def parse_stamps(
         If a stamp is missing or has another form; with its row.
     """
     first = next((text for text in texts.tolist() if STAMP.fullmatch(text)), str(texts[0]))
-    forms = _list_forms(first)
-    if not forms:
+    form = find_form(first)
+    if form is None:
         raise _build_stamp_error(texts, 0, rows, name, "a date such as 2026-01-31 12:00:00")
-    stamps = _normalise_stamps(texts)
-    attempts = [(form, _parse_form(stamps, form)) for form in forms]
-    readings = [attempt for attempt in attempts if not np.isnat(attempt[1]).any()]
+    attempts = parse_form(texts, form)
+    readings = {order: read for order, read in attempts.items() if not np.isnat(read).any()}
     if not readings:
-        place = int(np.flatnonzero(np.isnat(attempts[0][1]))[0])
+        place = int(np.flatnonzero(np.isnat(attempts[DAY_FIRST]))[0])
         raise _build_stamp_error(texts, place, rows, name, f"a time stamp such as {first}")
-    form, parsed = min(readings, key=lambda reading: _rank_reading(reading[1]))
-    if len(forms) > 1:
-        order = "day before the month" if form.startswith("%d") else "month before the day"
+    order = min(readings, key=lambda order: _rank_reading(readings[order]))
+    if len(attempts) > 1:
         notes.append(f"dates of column {name!r} were read with the {order}")
-    return parsed, form.endswith(_ZONE_FORM)
-
-
-def _list_forms(text: str) -> list[str]:
-    """List the forms that the first time stamp may have, as `strptime` writes them."""
-    match = STAMP.fullmatch(text) or DATE_ONLY.fullmatch(text)
-    if match is None:
-        return []
-    parts = match.groupdict()
-    zone = _ZONE_FORM if parts.get("zone") else ""
-    if parts.get("basic"):
-        return [f"%Y%m%d %H%M%S%.f{zone}"]
-    if parts["iso"]:
-        days = ["%Y{0}%m{0}%d".format(text[4])]
-    elif parts["month"]:
-        days = ["%d-%b-%Y"]
-    else:
-        sign = "." if parts["day"] or parts["short"] else parts["sign"] or "/"
-        year = "%y" if parts["short"] or parts["either_short"] else "%Y"
-        orders = ("%d{0}%m{0}{1}", "%m{0}%d{0}{1}")[: 1 if sign == "." else 2]
-        days = [order.format(sign, year) for order in orders]
-    clock = "%I:%M:%S%.f %p" if parts.get("half") else "%H:%M:%S%.f"
-    return [f"{day} {clock}{zone}" for day in days]
-
-
-def _normalise_stamps(texts: NDArray[np.str_]) -> "pl.Series":
-    """Write the same time stamp in one way: one blank, decimal points, ``Z`` for UTC."""
-    import polars as pl  # loaded only where stamps are read: its start takes time
-
-    series = pl.Series(texts.tolist(), dtype=pl.String)
-    for pattern, text in (
-        (r"^([^T\s]*)[T\s]+", "$1 "),
-        (r",\s", " "),
-        (r"(\d{2}),(\d+)", "$1.$2"),
-        (r"\s?([AaPp])\.?[Mm]\.?$", " ${1}M"),
-        (r"\s?(UTC|GMT|z)$", "Z"),
-        (r"\s([+-]\d{2}:?\d{2})$", "$1"),
-        (r"([+-]\d{2})$", "$1"),
-        (r"^(\S+)$", "$1 00:00:00"),
-        (r"( \d{1,3}:\d{2})($|[^:.\d].*$)", "$1:00$2"),
-    ):
-        series = series.str.replace(pattern, text)
-    return series
-
-
-def _parse_form(stamps: "pl.Series", form: str) -> NDArray[np.datetime64]:
-    """Parse time stamps of one form; one of another form gives NaT."""
-    zone = "UTC" if form.endswith(_ZONE_FORM) else None
-    parsed = stamps.str.to_datetime(form, strict=False, time_unit="ns", time_zone=zone)
-    return np.asarray(parsed.dt.replace_time_zone(None).to_numpy(), dtype="datetime64[ns]")
+    return readings[order], form.has_zone
 
 
 def _rank_reading(stamps: NDArray[np.datetime64]) -> tuple[bool, int]:

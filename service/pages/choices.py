@@ -57,11 +57,16 @@ def list_choices() -> dict[str, list[tuple[str, str]]]:
     }
 
 
-def write_choice(part: str, name: str, value: str) -> str:
+def write_choice(field: str, entries: Mapping[str, str]) -> str:
     """Write a setting of a note as the form has it: the field's label and the chosen text.
 
-    >>> write_choice("hold", "u", "zero")
+    >>> write_choice("hold", {"u": "zero"})
     '“u between samples: held (zero)”'
     """
-    label = f"{name} between samples" if part == "hold" else _LABELS.get(name, name)
-    return f"“{label}: {TEXTS.get(value, value)}”"
+    labels = {
+        name: f"{name} between samples" if field == "hold" else _LABELS.get(name, name)
+        for name in entries
+    }
+    return " and ".join(
+        f"“{labels[name]}: {TEXTS.get(value, value)}”" for name, value in entries.items()
+    )

@@ -11,7 +11,11 @@ from typing import TypeGuard
 DASH = "–"
 RELATIVE_UNIT = "σ"
 """Unit of the RMS over several outputs: the standard deviation of each."""
-_SETTING = re.compile(r"(?<!\bthe model )\b(\w+): \{([^{}:]+): ([^{}:,]+)\}")
+SETTING = re.compile(
+    r"(?<!\bthe model )\b(?P<field>\w+): "
+    r"\{(?P<entries>[^{}:,]+: [^{}:,]+(?:, [^{}:,]+: [^{}:,]+)*)\}"
+    r"|\b(?P<name>prediction): (?P<value>one-step|simulation)\b"
+)
 """A field of a job in a note, as in a job file: ``loss: {noise_model: ar1}``.
 
 Text after "the model" is excluded: it names a field of the model document, which no option sets.
@@ -145,20 +149,28 @@ def append_unit(name: str, symbol: str | None) -> str:
     return f"{name}{bracket_unit(symbol)}"
 
 
-def rewrite_settings(note: str, write: Callable[[str, str, str], str]) -> str:
+def rewrite_settings(note: str, write: Callable[[str, Mapping[str, str]], str]) -> str:
     """Rewrite a note so that it names settings as the reader types them, not as a job file does.
 
     Parameters
     ----------
     write : callable
-        Writes a setting from the field, the name in it and the value.
+        Writes a setting from the field, and the names and values in it. The field is empty for a
+        setting of the job itself.
 
     Examples
     --------
-    >>> rewrite_settings("use hold: {u: zero}", lambda *parts: "{}.{}={}".format(*parts))
-    'use hold.u=zero'
+    >>> rewrite_settings("use hold: {u: zero}", lambda field, entries: f"{field}={entries}")
+    "use hold={'u': 'zero'}"
     """
-    return _SETTING.sub(lambda match: write(*match.groups()), note)
+
+    def rewrite(match: re.Match[str]) -> str:
+        if match["name"]:
+            return write("", {match["name"]: match["value"]})
+        entries = (entry.split(": ") for entry in match["entries"].split(", "))
+        return write(match["field"], dict(entries))
+
+    return SETTING.sub(rewrite, note)
 
 
 def _is_positive(stderr: float | None) -> TypeGuard[float]:

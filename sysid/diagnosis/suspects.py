@@ -156,7 +156,10 @@ class _LinearFit:
 
     def _fit_drift(self, part: ResidualPart, where: str) -> Suspect:
         line = [self._pad(part, part.times**power) for power in (0, 1)]
-        cure = f"Give it a parameter: outputs: {{{part.output}: … + drift*t}}"
+        cure = (
+            f"Add drift*t to output {part.output} in the model's document, and drift to its "
+            "parameters"
+        )
         return Suspect(f"a drift of {where}", self._compute_gain(np.column_stack(line), 2), cure)
 
     def _fit_change(self, part: ResidualPart, where: str) -> Suspect:

@@ -1,11 +1,10 @@
 """Warnings about a result, in whole sentences."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from sysid.core.settings import GeneticAlgorithm
-from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.diagnosis.suspects import DYNAMICS, describe_suspects, find_suspects
 from sysid.diagnosis.unrecorded_input import warn_unrecorded_input
@@ -22,7 +21,7 @@ from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.residual_tests import ResidualTests
 from sysid.residuals.sandwich import MIN_REPEATS, count_repeats
 from sysid.search.island import get_island_settings
-from sysid.simulation.metrics import compute_mean
+from sysid.simulation.metrics import ChannelMetrics, Metrics
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.estimates import Estimate, NoiseColour, Uncertainty
@@ -57,8 +56,7 @@ def collect_warnings(
     problem: Problem,
     algorithm: GeneticAlgorithm,
     analysis: Analysis,
-    simulated: FloatArray,
-    rms: float,
+    metrics: Metrics,
     tests: ResidualTests | None = None,
     *,
     is_contradicted: bool = False,
@@ -67,7 +65,7 @@ def collect_warnings(
 
     `is_contradicted`: the data contradict the input that is assumed before the record.
     """
-    messages = []
+    messages, rms = [], metrics.rms
     limit = algorithm.safe_limit
     if limit is not None and rms > limit:
         messages.append(
@@ -81,7 +79,7 @@ def collect_warnings(
     messages += _warn_no_prediction(problem)
     messages += _warn_few_repeats(problem, analysis)
     messages += warn_constant_outputs(problem)
-    messages += _warn_worse_than_line(problem, simulated)
+    messages += _warn_worse_than_line(metrics.channels)
     messages += _warn_constant_inputs(problem, analysis.estimates)
     messages += _warn_early_response(problem) or warn_unrecorded_input(
         problem, analysis, is_contradicted=is_contradicted
@@ -160,7 +158,7 @@ def _warn_no_prediction(problem: Problem) -> list[str]:
     names = ", ".join(output.name for output in problem.model.outputs)
     return [
         f"no output ({names}) is a state by itself, so one-step predictions equal the free run. "
-        "To start each step from the measured output, write it as a state: outputs: {y: x}."
+        "To start each step from the measured output, make it a state in the model's document."
     ]
 
 
@@ -200,40 +198,17 @@ def warn_constant_outputs(problem: Problem) -> list[str]:
     return messages
 
 
-def _warn_worse_than_line(problem: Problem, simulated: FloatArray) -> list[str]:
+def _warn_worse_than_line(channels: Sequence[ChannelMetrics]) -> list[str]:
     """Warn if a straight line through an output fits better than the model."""
-    measured = problem.split_by_output(problem.evaluator.measured)
-    weights = problem.split_by_output(problem.evaluator.weight)
-    models = problem.split_by_output(simulated)
-    messages = []
-    for e, experiment in enumerate(problem.experiments):
-        for output, samples in zip(problem.model.outputs, experiment.outputs, strict=True):
-            scored = weights[e][output.name] > 0
-            if np.count_nonzero(scored) < 3:
-                continue
-            y, model = measured[e][output.name][scored], models[e][output.name][scored]
-            line = _compute_rms(y - _fit_line(samples.places[scored], y))
-            rms = _compute_rms(y - model)
-            if rms > line:
-                where = f" of experiment {e + 1}" if len(problem.experiments) > 1 else ""
-                unit = format_unit(output.unit)
-                messages.append(
-                    f"the model fits {output.name}{where} worse than a straight line "
-                    f"(RMS {rms:.4g} against {line:.4g}{unit})"
-                )
-    return messages
-
-
-def _fit_line(x: FloatArray, y: FloatArray) -> FloatArray:
-    centred = x - compute_mean(x)
-    spread = float(centred @ centred)
-    slope = float(centred @ (y - compute_mean(y))) / spread if spread > 0 else 0.0
-    return np.asarray(compute_mean(y) + slope * centred)
-
-
-def _compute_rms(values: FloatArray) -> float:
-    with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.sqrt(compute_mean(np.square(values))))
+    has_several = any(channel.experiment for channel in channels)
+    return [
+        f"the model fits {channel.output}"
+        f"{f' of experiment {channel.experiment + 1}' if has_several else ''} worse than a "
+        f"straight line (RMS {channel.rms:.4g} against {channel.line_rms:.4g}"
+        f"{format_unit(channel.unit)})"
+        for channel in channels
+        if channel.is_worse_than_line
+    ]
 
 
 def _warn_unidentified(estimate: Estimate, *, is_told: bool) -> str:

@@ -1,5 +1,6 @@
 """Read what a user gives to `identify`: recordings and tables, channels, changes of parameters."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from math import isfinite
 from numbers import Real
@@ -22,6 +23,7 @@ from sysid.residuals.onset_delay import find_unprompted_output
 
 Data: TypeAlias = Record | Recording | Labelled
 """One recording: a record, a recording without roles, or a table of another library."""
+_NUMBER = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?")
 Change: TypeAlias = Mapping[str, Any] | Sequence[float] | float
 """Change of a parameter: its fields, its two bounds, or its fixed value."""
 
@@ -76,17 +78,25 @@ def _check_holds(model: Model, holds: Mapping[str, object]) -> None:
             raise InvalidSettings(pointer, f"found {hold!r}; need one of {', '.join(HOLDS)}")
 
 
-def write_setting(field: str, name: str, value: str) -> str:
+def write_setting(field: str, entries: Mapping[str, str]) -> str:
     """Write a setting of a job as the argument of `identify` that gives it.
 
     Examples
     --------
-    >>> write_setting("hold", "u", "first")
+    >>> write_setting("hold", {"u": "first"})
     "hold={'u': 'first'}"
-    >>> write_setting("loss", "noise_model", "ar1")
-    "loss=Loss(noise_model='ar1')"
+    >>> write_setting("loss", {"kind": "soft-l1", "scale": "0.3"})
+    "loss=Loss(kind='soft-l1', scale=0.3)"
+    >>> write_setting("", {"prediction": "one-step"})
+    "prediction='one-step'"
     """
-    return f"loss=Loss({name}={value!r})" if field == "loss" else f"{field}={{{name!r}: {value!r}}}"
+    values = {
+        name: text if _NUMBER.fullmatch(text) else repr(text) for name, text in entries.items()
+    }
+    arguments = ", ".join(f"{name}={value}" for name, value in values.items())
+    if field in ("", "loss"):
+        return f"loss=Loss({arguments})" if field else arguments
+    return f"{field}={{{', '.join(f'{name!r}: {value}' for name, value in values.items())}}}"
 
 
 def describe_assignment(assigned: Assignment, records: Sequence[Record]) -> str:

@@ -96,7 +96,7 @@ def assign_channels(
         raise InvalidRecord(
             f"model {model.name!r} has inputs {inputs} and outputs {outputs}; the recording has "
             f"{', '.join(names) or 'no channels'}. Say which channel is which: "
-            f"{option(dict.fromkeys(left, '…'))}"
+            f"{' or '.join(option({**given, **one}) for one in _list_choices(model, left, free))}"
         )
     has_inputs = any(signal.name in guessed for signal in model.inputs)
     has_outputs = any(output.name in guessed for output in model.outputs)
@@ -266,6 +266,7 @@ def _check_given(given: Mapping[str, str], signals: Sequence[str], names: Sequen
 
 
 _ORDER = "their order"
+_MAX_CHOICES = 4
 _NAMES = "usual names of inputs and outputs"
 
 
@@ -299,6 +300,25 @@ def _guess_channels(
     bases = [_NAMES] if guessed or usual_inputs or usual_outputs else []
     guessed |= dict(zip((*inputs, *outputs), ordered, strict=True))
     return guessed, " and ".join([*bases, _ORDER])
+
+
+def _list_choices(model: Model, left: Sequence[str], free: Sequence[str]) -> list[dict[str, str]]:
+    """List possible channels of the signals that are left: one for each channel of the first.
+
+    Outputs take the last channels, except those that are usual names of outputs. Too many choices
+    are shown by the first. What there is no channel for is left open.
+    """
+    if len(free) < len(left):
+        return [dict.fromkeys(left, "…")]
+    outputs = [output.name for output in model.outputs if output.name in left]
+    usual = [name for name in free if _find_side(name, free) == "output"]
+    ordered = [*(name for name in free if name not in usual), *usual]
+    taken = dict(zip(outputs, ordered[len(ordered) - len(outputs) :], strict=True))
+    rest = [name for name in ordered if name not in taken.values()]
+    inputs = [name for name in left if name not in outputs]
+    if len(inputs) == 1 and len(rest) <= _MAX_CHOICES:
+        return [{inputs[0]: name, **taken} for name in rest]
+    return [{**dict(zip(inputs, rest, strict=False)), **taken}]
 
 
 def _match_letters(signals: Sequence[str], names: Sequence[str]) -> dict[str, str]:

@@ -410,6 +410,7 @@ class Identification:
                 tests=() if self.residual_tests is None else self.residual_tests.tests,
                 delays=self.delays,
                 orders=self.order_comparison,
+                channels=self.agreement,
             )
         )
 

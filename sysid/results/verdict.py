@@ -14,6 +14,7 @@ from sysid.core.text import plain_estimate, plain_unit
 if TYPE_CHECKING:  # the client's types name `Trust`, and load no numerics
     from sysid.residuals.residual_tests import ResidualTest
     from sysid.results.result import OrderComparison, SearchEvidence
+    from sysid.simulation.metrics import ChannelMetrics
     from sysid.uncertainty.estimates import Estimate
 
 Trust = Literal["trustworthy", "limited", "not trustworthy"]
@@ -92,6 +93,8 @@ class Evidence:
         Free parameters that time lags depend on.
     orders : OrderComparison or None
         Orders of a process, if they were compared.
+    channels : sequence of ChannelMetrics
+        Agreement with the estimation data.
     """
 
     estimates: "Sequence[Estimate]"
@@ -102,6 +105,7 @@ class Evidence:
     tests: "Sequence[ResidualTest]" = ()
     delays: tuple[str, ...] = ()
     orders: "OrderComparison | None" = None
+    channels: "Sequence[ChannelMetrics]" = ()
 
     @property
     def free(self) -> "list[Estimate]":
@@ -239,6 +243,34 @@ def _find_no_fit(evidence: Evidence) -> Iterator[Reason]:
         )
 
 
+def _find_straight_line(evidence: Evidence) -> Iterator[Reason]:
+    """Find outputs that a straight line explains better, over all experiments or in one."""
+    if _is_explained(evidence):
+        return
+    outputs = dict.fromkeys(one.output for one in evidence.channels if one.is_worse_than_line)
+    failed = [name for name in outputs if _is_worse_than_line(evidence.channels, name)]
+    if failed:
+        yield Reason(
+            "serious",
+            f"a straight line explains {_join(failed)} better",
+            f"A straight line fits {_join(failed)} better than the model, which has failed. Choose "
+            "another model, or look at channels, bounds, and a change during the recording.",
+        )
+    elif outputs:
+        yield Reason(
+            "caution",
+            f"a straight line explains a part of {_join(list(outputs))} better",
+            f"In some experiments a straight line fits {_join(list(outputs))} better than the "
+            "model: they tell little of it, or it does not hold there.",
+        )
+
+
+def _is_worse_than_line(channels: "Sequence[ChannelMetrics]", output: str) -> bool:
+    """Whether straight lines fit an output better than the model, over all experiments."""
+    own = [one for one in channels if one.output == output and isfinite(one.line_rms)]
+    return sum(one.samples * (one.rms**2 - one.line_rms**2) for one in own) > 0
+
+
 def _find_little_fit(evidence: Evidence) -> Iterator[Reason]:
     """Find a model that explains little of what is not noise, perhaps because of a bound."""
     fit = evidence.fit_percent
@@ -318,7 +350,7 @@ def _find_other_order(evidence: Evidence) -> Iterator[Reason]:
 
 
 def _find_missing_dynamics(evidence: Evidence) -> Iterator[Reason]:
-    if _is_number(evidence.fit_percent) and evidence.fit_percent >= _EXPLAINED:
+    if _is_explained(evidence):
         return
     orders, bounded = evidence.orders, evidence.list_names("at bound")
     if evidence.has_failed("whiteness") and set(bounded) & set(evidence.delays):
@@ -381,6 +413,7 @@ _FINDERS: tuple[Callable[[Evidence], Iterator[Reason]], ...] = (
     _find_constant_output,
     _find_unsettled,
     _find_no_fit,
+    _find_straight_line,
     _find_misled_run,
     _find_refuted,
     _find_bounds,
@@ -392,6 +425,10 @@ _FINDERS: tuple[Callable[[Evidence], Iterator[Reason]], ...] = (
     _find_insignificant_delays,
 )
 """What finds the reasons; within a severity, the first found makes the verdict's text."""
+
+
+def _is_explained(evidence: Evidence) -> bool:
+    return _is_number(evidence.fit_percent) and evidence.fit_percent >= _EXPLAINED
 
 
 def _join(names: Sequence[str]) -> str:

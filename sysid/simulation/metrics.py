@@ -29,11 +29,22 @@ def compute_fit_percent(measured: FloatArray, simulated: FloatArray) -> float:
     return 100.0 * (1.0 - float(np.linalg.norm(measured - simulated)) / spread)
 
 
+def compute_line_rms(x: FloatArray, y: FloatArray) -> float:
+    """Compute the RMS of the best straight line; ``nan`` for less than three samples."""
+    if y.size < 3:
+        return float("nan")
+    centred = x - compute_mean(x)
+    spread = float(centred @ centred)
+    slope = float(centred @ (y - compute_mean(y))) / spread if spread > 0 else 0.0
+    return rms(y - (compute_mean(y) + slope * centred))
+
+
 @dataclass(frozen=True, slots=True)
 class ChannelMetrics:
     """Agreement of one output of one experiment, over its scored samples.
 
     `span` holds the least and the largest measured value. The estimate holds for such amplitudes.
+    `line_rms` is the RMS of a straight line through the samples, or ``nan`` for less than three.
     """
 
     experiment: int
@@ -43,6 +54,12 @@ class ChannelMetrics:
     rms: float
     fit_percent: float
     span: tuple[float, float] = (float("nan"), float("nan"))
+    line_rms: float = float("nan")
+
+    @property
+    def is_worse_than_line(self) -> bool:
+        """Whether a straight line fits better than the model."""
+        return self.rms > self.line_rms
 
 
 @dataclass(frozen=True, slots=True)

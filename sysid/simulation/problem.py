@@ -32,6 +32,7 @@ from sysid.simulation.metrics import (
     ChannelMetrics,
     Metrics,
     compute_fit_percent,
+    compute_line_rms,
     compute_mean,
     rms,
 )
@@ -437,7 +438,8 @@ def _compute_channel_metrics(problem: Problem, simulated: FloatArray) -> list[Ch
         strict=True,
     )
     for experiment, (measured, model, weight) in enumerate(parts):
-        for output in problem.model.outputs:
+        places = (samples.places for samples in problem.experiments[experiment].outputs)
+        for output, x in zip(problem.model.outputs, places, strict=True):
             scored = weight[output.name] > 0
             if np.any(scored):
                 y, computed = measured[output.name][scored], model[output.name][scored]
@@ -450,6 +452,7 @@ def _compute_channel_metrics(problem: Problem, simulated: FloatArray) -> list[Ch
                         rms(y - computed),
                         compute_fit_percent(y, computed),
                         (float(np.min(y)), float(np.max(y))),
+                        compute_line_rms(x[scored], y),
                     )
                 )
     return channels

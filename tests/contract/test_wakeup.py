@@ -8,9 +8,10 @@ from sqlalchemy import text
 from service.queue.leases import LeaseQueue
 from service.queue.notifications import open_notifier
 from service.repositories.jobs import JobRepository
+from tests.limits import LIMIT_SECONDS
 from tests.stored import claimed, submit
 
-LONG = 60.0  # far beyond what a wake-up takes; a test that waits that long has failed
+LONG = LIMIT_SECONDS  # far beyond what a wake-up takes; a test that waits that long has failed
 
 
 def settle(waker):

@@ -18,7 +18,8 @@ from tests.standing import Service
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(400)]
 
-LONG = {"generations": 30_000, "islands": 4, "stop": {"settled": None}}
+LONG = {"generations": 10_000_000, "islands": 4, "stop": {"settled": None, "seconds": 20.0}}
+"""A run that computes for so long on any machine."""
 NAMESPACE = ["unshare", "--user", "--map-root-user", "--mount"]
 """Runs a command as the root of a namespace, who may mount there."""
 

@@ -11,10 +11,13 @@ import typer
 
 from service.cli.identify import FileOptions, read_input_file
 from service.formats import limits as format_limits
+from service.formats import sandbox
 from service.formats.limits import DEFAULT_LIMITS, MIB
 from service.formats.sandbox import read_untrusted
+from sysid.core.child_processes import run_child
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
+from tests.limits import LIMIT_SECONDS
 from tests.mcap_files import foreign, json_messages, recorded
 
 TIMES = np.arange(200) * 0.01
@@ -71,17 +74,24 @@ def test_a_file_larger_than_the_limit_is_refused(tmp_path: Path) -> None:
     assert "at most 10" in refused(saved(tmp_path, bytes(11)), limits=limits).detail
 
 
+@pytest.mark.usefixtures("endless_children")
 def test_a_file_that_takes_too_long_is_refused(tmp_path: Path) -> None:
     limits = replace(DEFAULT_LIMITS, seconds=0.01)
     assert "takes more than 0.01 s" in refused(saved(tmp_path, b""), limits=limits).detail
 
 
-@pytest.mark.slow
-def test_a_file_that_burns_the_processor_is_stopped(tmp_path: Path) -> None:
-    rows = "".join(f"{k},\n" for k in range(2_000_000))  # empty fields take the slow way
+@pytest.mark.usefixtures("endless_children")
+def test_a_file_that_burns_the_processor_is_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     limits = replace(DEFAULT_LIMITS, seconds=0.9)
-    error = refused(saved(tmp_path, f"t,u\n{rows}".encode()), limits=limits)
+    monkeypatch.setattr(sandbox, "run_child", run_for_long)  # its own limit ends it
+    error = refused(saved(tmp_path, b"t,u\n0,1\n"), limits=limits)
     assert "takes more than 0.9 s" in error.detail
+
+
+def run_for_long(module: str, task: bytes, *, seconds: float, folder: str) -> object:
+    return run_child(module, task, seconds=LIMIT_SECONDS + seconds, folder=folder)
 
 
 @pytest.mark.slow
@@ -110,15 +120,24 @@ def test_identify_reads_mcap_under_the_limits_of_the_service(
     path.write_bytes(recorded(Recording((Channel("u", times, np.sin(times)),))))
     own = FileOptions(None, ())
     np.testing.assert_array_equal(read_input_file(path, own).channel("u").values, np.sin(times))
-    for change, words in (
-        ({"memory_bytes": 64 * MIB}, "64 MiB of memory"),
-        ({"seconds": 0.01}, "takes more than 0.01 s"),
-    ):
-        smaller = replace(DEFAULT_LIMITS, **change)  # type: ignore[arg-type]
-        monkeypatch.setattr(format_limits, "DEFAULT_LIMITS", smaller)
-        with pytest.raises(typer.Exit):
-            read_input_file(path, own)
-        assert words in capsys.readouterr().err
+    smaller = replace(DEFAULT_LIMITS, memory_bytes=64 * MIB)
+    monkeypatch.setattr(format_limits, "DEFAULT_LIMITS", smaller)
+    with pytest.raises(typer.Exit):
+        read_input_file(path, own)
+    assert "64 MiB of memory" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("endless_children")
+def test_identify_reads_a_file_no_longer_than_the_service(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = replace(DEFAULT_LIMITS, seconds=0.01)
+    monkeypatch.setattr(format_limits, "DEFAULT_LIMITS", short)
+    with pytest.raises(typer.Exit):
+        read_input_file(
+            saved(tmp_path, b"t,u\n0,1\n").rename(tmp_path / "a.mcap"), FileOptions(None, ())
+        )
+    assert "takes more than 0.01 s" in capsys.readouterr().err
 
 
 def test_the_reader_does_not_see_the_secrets_of_the_environment(

@@ -3,11 +3,12 @@
 import email
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,17 +28,47 @@ PYTHONS = ("3.11", "3.12", "3.13")
 LIMIT_SECONDS = 900.0  # libraries are fetched, and the search is compiled
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel of the tracked files, built by the tools that are here."""
-    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+def list_tracked_files() -> list[str]:
     listing = subprocess.run(
         ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    for name in filter(None, listing.stdout.split("\0")):
-        if (ROOT / name).is_file():
-            (source / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(ROOT / name, source / name)
+    return [name for name in listing.stdout.split("\0") if name and (ROOT / name).is_file()]
+
+
+def list_image_files() -> dict[str, str]:
+    """Files that the image's build copies, by their places there: all that its wheel is made of."""
+    dockerfile = (ROOT / "docker/Dockerfile").read_text()
+    ignored = re.compile(
+        "|".join(map(to_pattern, (ROOT / ".dockerignore").read_text().splitlines()))
+    )
+    kept = [name for name in list_tracked_files() if not ignored.match(name)]
+    files = {}
+    for words in re.findall(r"^COPY (?!--from)(.+)$", dockerfile, re.MULTILINE):
+        *sources, target = words.split()
+        for source in sources:
+            found = {name: name.removeprefix(source) for name in kept if is_below(name, source)}
+            assert found, f"{source} is left out by .dockerignore"
+            for name, rest in found.items():
+                place = f"{target}/{Path(source).name}" if target.endswith("/") else target
+                files[os.path.normpath(f"{place}{rest}")] = name
+    return files
+
+
+def is_below(name: str, folder: str) -> bool:
+    return name == folder or name.startswith(f"{folder}/")
+
+
+def to_pattern(line: str) -> str:
+    """The pattern of a line of ``.dockerignore``: what it names, and all below."""
+    path = line.replace(".", r"\.").replace("**/", "(?:.+/)?").replace("*", "[^/]*")
+    return f"{path}(/|$)"
+
+
+def build_wheel(files: Mapping[str, str], source: Path, target: Path) -> Path:
+    """Build the wheel of some files by the tools that are here; a file by its place."""
+    for place, name in files.items():
+        (source / place).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(ROOT / name, source / place)
     options = ("--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check")
     built = subprocess.run(
         [sys.executable, "-m", "pip", "wheel", "--quiet", *options, "-w", target, source],
@@ -48,6 +79,34 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert built.returncode == 0, built.stderr
     (path,) = target.iterdir()
     return path
+
+
+@pytest.fixture(scope="module")
+def tracked_wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of the checkout."""
+    files = {name: name for name in list_tracked_files()}
+    return build_wheel(files, tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def image_wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of what `docker/Dockerfile` copies."""
+    files = list_image_files()
+    return build_wheel(files, tmp_path_factory.mktemp("image"), tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(params=["tracked_wheel", "image_wheel"])
+def wheel(request: pytest.FixtureRequest) -> Path:
+    path: Path = request.getfixturevalue(request.param)
+    return path
+
+
+def test_the_image_copies_nothing_that_is_left_out() -> None:
+    files = list_image_files()
+    assert {"pyproject.toml", "server.lock", "requirements.lock", "lagid/__init__.py"} <= {*files}
+    assert not [name for name in files if name.startswith(("tests/", "docs/site/", "benchmarks/"))]
+    assert re.match(to_pattern("**/__pycache__"), "service/api/__pycache__/a.pyc")
+    assert not re.match(to_pattern("build"), "builder/a")
 
 
 def test_the_wheel_holds_all_that_runs_and_no_tests(wheel: Path) -> None:
@@ -64,10 +123,16 @@ def test_the_wheel_holds_all_that_runs_and_no_tests(wheel: Path) -> None:
         "migrations/script.py.mako",
         "*/py.typed",
         "service/client/*.pyi",
+        "docs/*.md",
+        "docs/*/*.md",
+        "docs/*.png",
+        "docs/*/pictures/*.png",
+        "docs/openapi.json",
     ):
         files = {str(p.relative_to(ROOT)) for p in ROOT.glob(pattern) if p.is_file()}
         assert files
-        assert files - names == set()
+        guides = {re.sub("^docs/", "service/guides/", name) for name in files}
+        assert guides - names == set()
     assert {f"{part}/py.typed" for part in ("lagid", "sysid", "workers", "service")} <= names
     information = {name.rpartition("/")[2] for name in names if ".dist-info/" in name}
     assert {"LICENSE", "METADATA", "entry_points.txt"} <= information
@@ -85,7 +150,9 @@ def test_the_wheel_names_its_version_licence_extras_and_command(wheel: Path) -> 
     assert about["Version"] == lagid.__version__
     assert about["License-Expression"] == "Apache-2.0"
     assert about["Requires-Python"] == ">=3.11"
-    assert {*about.get_all("Provides-Extra")} == {"server", "postgres", "notebook", "test"}
+    assert {*about.get_all("Provides-Extra")} == {
+        *("server", "postgres", "notebook", "parquet", "test")
+    }
     classifiers = about.get_all("Classifier")
     assert {f"Programming Language :: Python :: {one}" for one in PYTHONS} <= {*classifiers}
     assert "lagid = lagid:main" in command
@@ -236,11 +303,13 @@ def here(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Installatio
 
 @pytest.mark.night
 @pytest.mark.timeout(3600)
-def test_the_wheel_identifies_serves_and_runs_a_job(wheel: Path, here: Installation) -> None:
+def test_the_wheel_identifies_serves_and_runs_a_job(
+    tracked_wheel: Path, here: Installation
+) -> None:
     (here.folder / "steps.csv").write_bytes(recording())
     identify = ("identify", "steps.csv", "--model", "fopdt")
 
-    here.install(str(wheel))
+    here.install(str(tracked_wheel))
     import lagid
 
     assert here.run("lagid", "--version").stdout == f"lagid {lagid.__version__}\n"
@@ -261,7 +330,7 @@ def test_the_wheel_identifies_serves_and_runs_a_job(wheel: Path, here: Installat
     face = here.run("python", "face.py")
     assert face.stdout == "sysid.identification.identify service.client.client\n", face.stderr
 
-    here.install(f"{wheel}[server]")
+    here.install(f"{tracked_wheel}[server]")
     with here.serve() as url:
         place = ("--url", url)
         assert here.run_json("dataset", "add", "steps.csv", *place)["name"] == "steps"

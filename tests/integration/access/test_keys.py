@@ -5,6 +5,7 @@ import re
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
@@ -249,11 +250,18 @@ def test_an_open_event_stream_ends_after_its_key(
 ) -> None:
     monkeypatch.setattr(events, "KEEP_ALIVE_S", 0.05)
     token, parts = guarded.add_key(), guarded.parts
-    job = submit(parts.database)
+    job, has_waited, wait_for_news = submit(parts.database), Event(), parts.feed.wait_for_news
+
+    async def wait(*asked: Any) -> bool:
+        is_news = await wait_for_news(*asked)
+        has_waited.set()
+        return is_news
+
+    monkeypatch.setattr(parts.feed, "wait_for_news", wait)
     with ThreadPoolExecutor(1) as pool:
         stream = pool.submit(guarded.ask, "GET", f"/v1/jobs/{job}/events", token)
-        with pytest.raises(TimeoutError):
-            stream.result(timeout=0.5)
+        assert has_waited.wait(LIMIT_SECONDS)
+        assert not stream.done()
         change_key(guarded, token, revoked_at=datetime.now(UTC))
         answer = stream.result(timeout=LIMIT_SECONDS)
     assert answer.status_code == 200

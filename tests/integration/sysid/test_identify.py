@@ -119,6 +119,7 @@ def test_a_model_worse_than_a_straight_line_is_told() -> None:
     ramp = Record(record(clean()).inputs, (Channel("y", times, 50.0 + 3.0 * times),))
     found = identify(DUFFING_MODEL, ramp)
     assert any("straight line" in warning for warning in found.warnings)
+    assert found.verdict.trust == "not trustworthy"
 
 
 def test_an_estimate_at_its_bound_is_told() -> None:

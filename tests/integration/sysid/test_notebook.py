@@ -428,6 +428,15 @@ def test_a_result_without_data_draws_what_it_has(found: Identification) -> None:
     assert repr(bare).startswith("Identification, fit")
 
 
+def test_a_picture_file_says_what_it_needs(
+    found: Identification, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "kaleido", None)
+    with pytest.raises(Exception, match="requires the Kaleido package") as told:
+        found.plot("response").write_image(tmp_path / "answer.svg")
+    assert 'pip install --upgrade "kaleido>=1"' in str(told.value)
+
+
 @pytest.mark.parametrize(("library", "call"), [("pandas", "to_pandas"), ("plotly", "plot")])
 def test_a_missing_library_is_told(
     found: Identification, monkeypatch: pytest.MonkeyPatch, library: str, call: str

@@ -68,6 +68,7 @@ def test_a_run_whose_model_diverges_everywhere_fails_with_that_message() -> None
     assert "Narrow the bounds" in done.outcome.reason
 
 
+@pytest.mark.usefixtures("endless_children")
 def test_a_run_whose_model_needs_too_long_to_compile_fails_alone_with_the_limit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

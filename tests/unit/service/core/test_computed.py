@@ -27,6 +27,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     made = Clock()
+    monkeypatch.setattr(computed, "FRESH_SECONDS", FRESH_SECONDS)
     monkeypatch.setattr(computed, "time", SimpleNamespace(monotonic=made))
     return made
 

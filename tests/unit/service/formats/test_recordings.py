@@ -5,6 +5,7 @@ import io
 import pickle
 import re
 import struct
+import sys
 import warnings
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -457,6 +458,16 @@ def test_parquet_keeps_units_stamps_and_zones(tmp_path: Path) -> None:
     assert recording.started_at == START.replace(tzinfo=UTC)
     with pytest.raises(UnreadableFile, match="the Parquet file cannot be read"):
         read_bytes(tmp_path, plain[: len(plain) // 2])
+
+
+def test_parquet_without_its_library_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = write_parquet(t=TIMES, u=INPUT)
+    monkeypatch.setitem(sys.modules, "polars", None)
+    with pytest.raises(UnreadableFile, match=r"pip install 'lagid\[parquet\]'$"):
+        read_bytes(tmp_path, content)
+    check_experiment(read_csv(join_rows("t,u,y", time=STAMPS["iso"][1]).encode())[0])
 
 
 def test_a_sheet_is_found_below_a_preamble_and_beside_others(tmp_path: Path) -> None:

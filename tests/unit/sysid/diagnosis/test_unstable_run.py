@@ -54,7 +54,7 @@ def make_record(u: FloatArray, y: FloatArray) -> Record:
 
 
 def list_told(found: Identification) -> list[str]:
-    return [text for text in found.warnings if "Use prediction: one-step" in text]
+    return [text for text in found.warnings if "Use prediction='one-step'" in text]
 
 
 @pytest.mark.parametrize("seed", [1, 3])

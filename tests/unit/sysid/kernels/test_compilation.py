@@ -19,8 +19,8 @@ from tests.models import differential, duffing
 VARIANT = KernelVariant(one_step=False, soft=False, on_grid=True, weighted=False)
 
 
-def long_model() -> Model:
-    """A model that takes seconds to compile."""
+def large_model() -> Model:
+    """A model whose compilation takes far more memory than the interpreter."""
     terms = "+".join(f"tanh(y)*exp(-y*b)*sin({n}*b)" for n in range(90))
     bounds = {"b": {"lower": 0, "upper": 1}}
     return differential({"y": terms}, "y", parameters=bounds)
@@ -38,6 +38,7 @@ def test_the_child_compiles_the_same_code_and_imports_nothing_of_the_working_fol
     assert compile_kernel(duffing(), VARIANT) == compile_assembly(emit_kernel(duffing(), VARIANT))
 
 
+@pytest.mark.usefixtures("endless_children")
 def test_the_time_of_a_compilation_is_told_to_the_operator(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -60,19 +61,31 @@ def test_the_task_of_the_child_has_all_that_a_kernel_depends_on(name: str) -> No
     ("limit", "value", "told"),
     [
         ("PROCESSOR_SECONDS", 1.0, "more than 1 s of processor time"),
-        ("MEMORY_BYTES", 200 * 1024**2, "more than 200 MiB of memory"),
         ("_WALL_SECONDS", 0.3, "more than 0.3 s;"),
     ],
 )
-def test_a_model_beyond_a_limit_is_refused_with_the_limit(
+@pytest.mark.usefixtures("endless_children")
+def test_a_model_beyond_a_limit_of_time_is_refused_with_the_limit(
     monkeypatch: pytest.MonkeyPatch, limit: str, value: float, told: str
 ) -> None:
     monkeypatch.setattr(compilation, limit, value)
+    assert told in refuse_model(duffing())
+
+
+def test_a_model_beyond_the_limit_of_memory_is_refused_with_the_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(compilation, "MEMORY_BYTES", 200 * 1024**2)
+    assert "more than 200 MiB of memory" in refuse_model(large_model())
+
+
+def refuse_model(model: Model) -> str:
+    """Return what is said of a model that cannot be compiled."""
     with pytest.raises(InvalidModel) as refused:
-        compile_kernel(long_model(), VARIANT)
+        compile_kernel(model, VARIANT)
     (fault,) = refused.value.faults
     assert fault.pointer == "/equations"
-    assert told in fault.detail
+    return fault.detail
 
 
 def test_what_was_refused_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -106,8 +106,15 @@ def test_a_channel_may_be_given_as_its_heading(text: str) -> None:
 
 
 def test_a_signal_without_a_channel_is_told_with_all_channels() -> None:
-    with pytest.raises(InvalidRecord, match=r"inputs u and outputs y.*P1, P2, P3.*'u': …, 'y': …"):
+    choices = r"{'u': 'P1', 'y': 'P3'} or channels={'u': 'P2', 'y': 'P3'}$"
+    with pytest.raises(InvalidRecord, match=rf"inputs u and outputs y.*P1, P2, P3.*{choices}"):
         assign_channels(MODEL, ["P1", "P2", "P3"])
+    with pytest.raises(InvalidRecord, match=r"'y': 'P1', 'u': 'P2'} or .*'u': 'P3'}$"):
+        assign_channels(MODEL, ["P1", "P2", "P3"], {"y": "P1"})
+    with pytest.raises(InvalidRecord, match=r"which: channels={'u': 'P0', 'y': 'y1'}$"):
+        assign_channels(MODEL, ["y1", *(f"P{n}" for n in range(9))])
+    with pytest.raises(InvalidRecord, match=r"which: channels={'u': …, 'y': …}$"):
+        assign_channels(MODEL, ["P1"])
     with pytest.raises(InvalidRecord, match="'y': …"):
         assign_channels(MODEL, ["u"])
     with pytest.raises(InvalidRecord, match="the recording has no channels"):

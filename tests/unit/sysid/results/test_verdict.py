@@ -8,6 +8,7 @@ import pytest
 from sysid.residuals.residual_tests import ResidualTest
 from sysid.results.result import OrderComparison, OrderFit, SearchEvidence
 from sysid.results.verdict import Evidence, judge_result
+from sysid.simulation.metrics import ChannelMetrics
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
 
 
@@ -18,6 +19,10 @@ def estimate(name: str, status: EstimateStatus = "identified", *, value: float =
 def residual_test(kind: Any = "whiteness", *, p: float = 1e-9) -> ResidualTest:
     outcome = "failed" if p < 0.05 else "passed"
     return ResidualTest(0, "y", kind, "u" if kind == "independence" else None, outcome, 900, p=p)
+
+
+def channel(rms: float, line_rms: float, experiment: int = 0) -> ChannelMetrics:
+    return ChannelMetrics(experiment, "y", "V", 100, rms, 95.0, line_rms=line_rms)
 
 
 def judged(**evidence: Any) -> tuple[str, str]:
@@ -34,6 +39,15 @@ def judged(**evidence: Any) -> tuple[str, str]:
 
 def test_a_small_fit_beside_much_white_noise_is_trustworthy() -> None:
     assert judged(fit_percent=15.0) == ("trustworthy", "trustworthy")
+
+
+def test_a_straight_line_through_a_part_or_the_errors_of_the_solver_is_not_serious() -> None:
+    quiet = [channel(0.1, 2.0), channel(0.11, 0.1, 1)]
+    text = "trustworthy, but a straight line explains a part of y better"
+    assert judged(channels=quiet) == ("limited", text)
+    assert judged(channels=quiet, fit_percent=99.9999) == ("trustworthy", "trustworthy")
+    few = [channel(0.1, math.nan), channel(0.1, 2.0, 1)]
+    assert judged(channels=few) == ("trustworthy", "trustworthy")
 
 
 def test_a_result_that_nothing_speaks_against_is_trustworthy() -> None:
@@ -59,6 +73,7 @@ def test_a_result_that_nothing_speaks_against_is_trustworthy() -> None:
             {"estimates": [estimate("K", "group"), estimate("T", "group")]},
             "the data determine K and T only in combination",
         ),
+        ({"channels": [channel(0.3, 0.2)]}, "a straight line explains y better"),
         ({"estimates": [estimate("K", "unidentifiable")]}, "the data do not determine K"),
         ({"estimates": [estimate("K", "prediction-dependent")]}, "K differs one step ahead"),
         (

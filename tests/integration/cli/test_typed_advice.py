@@ -1,0 +1,174 @@
+"""What a message advises works when it is typed: settings, channels, starts and documents."""
+
+import ast
+import json
+import math
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import fields
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from lagid import Loss
+from service.cli.common import apply_setting
+from service.cli.identify import FIELD_ORIGINS
+from service.core.documents import parse_yaml
+from service.jobs.schemas import JobIn
+from service.plants.tube import Tube
+from sysid.core.text import SETTING, rewrite_settings
+from sysid.identification.arguments import write_setting
+from tests.commands import run_lagid
+from tests.sources import list_modules
+
+OPEN = "…"
+"""Stands in a text for what is known when it is written."""
+VALUES = {("hold", OPEN): ("u", "zero"), ("loss", "scale"): ("scale", "0.3")}
+"""Field and name of a setting → a name and a value for what is open in it."""
+OF_A_MODEL = {"history"}
+"""Fields of the model's document that messages about this document write."""
+QUICK = ("--set", "algorithm.generations=2")
+BODY = {"model": "fopdt", "datasets": ["a"]}
+
+
+def list_texts(path: Path) -> Iterator[str]:
+    """List the texts that a module may print, with `OPEN` for what is put in."""
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    parts = {id(part) for node in nodes if isinstance(node, ast.JoinedStr) for part in node.values}
+    silent = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    for node in nodes:
+        if id(node) not in parts | silent and (text := read_text(node)):
+            yield text
+
+
+def read_text(node: ast.AST) -> str:
+    if isinstance(node, ast.JoinedStr):
+        return "".join(read_text(part) or OPEN for part in node.values)
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    return ""
+
+
+@cache
+def list_all_texts() -> list[str]:
+    return [text for path in list_modules(("sysid", "service")) for text in list_texts(path)]
+
+
+def fill(match: re.Match[str]) -> str:
+    """Write the setting of a text with values for what is open."""
+    if match["name"]:
+        return match[0]
+    entries = [entry.split(": ") for entry in match["entries"].split(", ")]
+    filled = [VALUES.get((match["field"], name), (name, value)) for name, value in entries]
+    return f"{match['field']}: {{{', '.join(map(': '.join, filled))}}}"
+
+
+def list_settings() -> list[str]:
+    """List the settings of jobs that notes advise, as job files have them."""
+    found = [match for text in list_all_texts() for match in SETTING.finditer(text)]
+    own = [match for match in found if not match["field"] or match["field"] not in OF_A_MODEL]
+    return sorted({fill(match) for match in own if "\n" not in match.string})
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A response with dead time to `heat`, beside a fan that does nothing."""
+    path, x = tmp_path_factory.mktemp("data") / "two.csv", 0.0
+    rows = ["t,fan,heat,temp"]
+    for k in range(200):
+        heat = int((k - 3) // 25 % 2 == 1)
+        rows.append(f"{k},{int(k % 40 > 20)},{int(k // 25 % 2 == 1)},{x:.5f}")
+        x += 0.1 * (2 * heat - x)
+    path.write_text("\n".join(rows))
+    return path
+
+
+def identify(data: Path, *words: object, model: object = "fopdt") -> str:
+    channels = ("--channels", "u=heat,y=temp")
+    done = run_lagid("identify", data, "--model", model, *channels, *QUICK, *words)
+    assert done.code == 0, done.stderr
+    return done.stdout
+
+
+def test_settings_are_found_where_they_are_written() -> None:
+    some = {"hold: {u: zero}", "loss: {noise_model: ar1}", "prediction: one-step"}
+    assert some <= {*list_settings()}
+    assert {"validation.fraction=0.3", "parameters.L.upper=0.5"} <= {*list_changes()}
+
+
+def test_a_setting_in_a_note_works_in_a_job_file_a_command_and_a_notebook(data: Path) -> None:
+    for setting in list_settings():
+        given = parse_yaml(setting.encode())
+        JobIn.model_validate({**BODY, **given})
+        identify(data, *shlex.split(FIELD_ORIGINS.rewrite_note(setting)))
+        arguments = eval(f"dict({rewrite_settings(setting, write_setting)})", {"Loss": Loss})
+        assert [*arguments] == [*given]
+
+
+def list_changes() -> list[str]:
+    """List the values of ``--set`` that commands print."""
+    found = {
+        change
+        for text in list_all_texts()
+        for change in re.findall(r"(?<!lagid: )--set ([\w.]+=[\w.]*\w)", text)
+    }
+    return sorted(found)
+
+
+def test_a_set_that_is_printed_is_one_of_a_job_or_a_plant() -> None:
+    for change in list_changes():
+        if change.partition("=")[0] not in {field.name for field in fields(Tube)}:
+            body: dict[str, object] = dict(BODY)
+            apply_setting(body, change)
+            JobIn.model_validate(body)
+
+
+@pytest.mark.parametrize(
+    "change", ["initial.x=0.25", "initial.x={lower: -1, upper: 1}", "initial.x.upper=9"]
+)
+def test_the_advice_about_a_start_can_be_typed(data: Path, change: str) -> None:
+    done = run_lagid("identify", data, "--model", "fopdt", "--set", change)
+    (advice,) = re.findall(r"--set '(.*?)'", done.stderr)
+    identify(data, "--set", advice)
+    word = run_lagid("identify", data, "--model", "fopdt", "--set", "initial.x=measured").stderr
+    assert "the model's document, which lagid models show prints" in word
+
+
+def test_a_start_that_a_built_in_model_measures_is_searched_by_a_document(
+    data: Path, tmp_path: Path
+) -> None:
+    words = ("--channels", "y=temp", "--set", "initial.x={lower: -1, upper: 1}")
+    refusal = run_lagid("identify", data, "--model", "mackey-glass", *words).stderr
+    assert "If the model does not search it, write it into the model's document" in refusal
+    document = parse_yaml(run_lagid("models", "show", "mackey-glass").stdout.encode())
+    document["initial"]["x"] = {"lower": -1, "upper": 1}
+    model = tmp_path / "mine.json"
+    model.write_text(json.dumps(document))
+    done = run_lagid("identify", data, "--model", model, *words[:2], *QUICK, "--json")
+    assert "x(0)" in {one["name"] for one in json.loads(done.stdout)["parameters"]}
+
+
+def test_the_channels_that_a_refusal_names_can_be_typed(data: Path) -> None:
+    refusal = run_lagid("identify", data, "--model", "fopdt").stderr
+    choices = re.findall(r"--channels (\S+)", refusal)
+    assert choices == ["u=fan,y=temp", "u=heat,y=temp"]
+    for channels in choices:
+        done = run_lagid("identify", data, "--model", "fopdt", "--channels", channels, *QUICK)
+        assert done.code == 0, done.stderr
+
+
+def test_a_drift_in_the_model_s_document_is_estimated(data: Path, tmp_path: Path) -> None:
+    document = parse_yaml(run_lagid("models", "show", "fopdt").stdout.encode())
+    document["outputs"]["y"] += " + drift*t"
+    document["parameters"]["drift"] = {"lower": -1, "upper": 1}
+    model, drifting = tmp_path / "mine.json", tmp_path / "drifting.csv"
+    model.write_text(json.dumps(document))
+    head, *rows = data.read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    lines = [f"{t},{fan},{heat},{float(y) + 0.01 * float(t):.5f}" for t, fan, heat, y in cells]
+    drifting.write_text("\n".join([head, *lines]))
+    found = json.loads(identify(drifting, "--json", model=model))
+    (drift,) = [one["value"] for one in found["parameters"] if one["name"] == "drift"]
+    assert math.isclose(drift, 0.01, rel_tol=0.02)
