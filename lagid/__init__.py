@@ -54,7 +54,7 @@ def _describe_clash() -> str | None:
             module = import_module(package)
         except Exception as error:  # noqa: BLE001 - whatever a foreign package does when loaded
             return f"lagid cannot load its package {package!r} ({error}). {_advise(package)}"
-        if getattr(module, "DISTRIBUTION", None) != _DISTRIBUTION:
+        if getattr(module, "_DISTRIBUTION", None) != _DISTRIBUTION:
             place = getattr(module, "__file__", None) or next(iter(module.__path__), "nowhere")
             return f"{place} is not the package {package!r} of lagid. {_advise(package)}"
     return None

@@ -1,4 +1,4 @@
 """REST, pages, command line, storage and dispatch."""
 
-DISTRIBUTION = "lagid"
+_DISTRIBUTION = "lagid"
 """Tells this package from others of the name; `lagid` looks at it."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from sysid.core.lazy_names import put_off_imports
 
-DISTRIBUTION = "lagid"
+_DISTRIBUTION = "lagid"
 """Tells this package from others of the name; `lagid` looks at it."""
 
 if TYPE_CHECKING:

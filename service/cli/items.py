@@ -7,6 +7,7 @@ import typer
 
 from service.cli.common import (
     OUTPUT_PANEL,
+    Document,
     ask_to_go_on,
     fail,
     fail_usage,
@@ -14,7 +15,7 @@ from service.cli.common import (
     server_command,
     show_examples,
 )
-from service.client.calls import Document, ProblemError
+from service.client.calls import ProblemError
 
 if TYPE_CHECKING:
     from service.client.client import Client

@@ -6,13 +6,13 @@ RMS, since RMS on different data or under different noise cannot be compared.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from service.cli.common import PlainConsole, err
+from service.cli.common import Document, PlainConsole, err
 from service.client.calls import TERMINAL_STATES
 from service.core.text import format_duration, format_value
 from service.core.text_checks import escape_controls
@@ -35,7 +35,6 @@ BAR_COLUMNS = (
     TextColumn("{task.fields[state]}"),
     TimeElapsedColumn(),
 )
-Document = Mapping[str, Any]
 Clock = Callable[[], float]
 
 

@@ -3,23 +3,23 @@
 import ast
 from collections.abc import Iterator
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 
 def put_off_imports(package: dict[str, Any]) -> None:
     """Import the public names of a package when they are used, each from its own module.
 
-    They are those of the block ``if TYPE_CHECKING:`` at the end of the package's file, so that type
-    checkers and editors read plain imports, and a name stands once. A star stands for the public
-    names of a package that does the same. The mechanism is that of SPEC 1 of Scientific Python.
+    They are those of the block ``if TYPE_CHECKING:`` of the package's source, so that type checkers
+    and editors read plain imports, and a name stands once. A star stands for the public names of a
+    package that does the same. SPEC 1 of Scientific Python does so with a stub.
 
     Parameters
     ----------
     package : dict of str to Any
         The ``globals()`` of the package. It is given ``__all__`` and ``__getattr__``.
     """
-    modules = dict(_list_imports(Path(package["__file__"]).read_text(encoding="utf-8")))
+    source = package["__spec__"].loader.get_source(package["__name__"])
+    modules = dict(_list_imports(source))
 
     def load_name(name: str) -> Any:
         if name not in modules:

@@ -1,5 +1,6 @@
 """Imports that are put off until their names are used."""
 
+from importlib.util import spec_from_file_location
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ def make_package(folder: Path, *imports: str) -> dict[str, Any]:
     """A package whose block has these lines."""
     path = folder / "package.py"
     path.write_text("\n    ".join(["if TYPE_CHECKING:", *imports]) + "\n")
-    package: dict[str, Any] = {"__name__": "package", "__file__": str(path)}
+    spec = spec_from_file_location("package", path)
+    package: dict[str, Any] = {"__name__": "package", "__spec__": spec}
     put_off_imports(package)
     return package
 
