@@ -100,6 +100,7 @@ def new_dataset(**values) -> NewDataset:
         "duration": 1.0,
         "sample_time": 0.25,
         "channels": [{"name": "u", "unit": "V"}],
+        "details": {"segments": [], "started_at": None, "warnings": []},
         **values,
     }
     return NewDataset(**given)

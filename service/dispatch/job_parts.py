@@ -68,7 +68,7 @@ class SharedParts(NamedTuple):
             self.algorithm,
             int(cell.get("/seed", body["seed"])),
             warm,
-            posterior=body.get("posterior", False),  # older jobs do not have it
+            posterior=body["posterior"],
             compare_orders=self.compare_orders,
         )
 
@@ -144,7 +144,7 @@ class JobParts:
 
     def _compares_orders(self, body: Mapping[str, Any]) -> bool:
         """Whether the orders of a process are compared: by default only if there is no sweep."""
-        requested: bool | None = body.get("compare_orders")  # older jobs do not have it
+        requested: bool | None = body["compare_orders"]
         return not self.job.spec["sweep"]["axes"] if requested is None else requested
 
     def load_records(self, key: str) -> Records:
@@ -193,5 +193,5 @@ class JobParts:
 
 def _choose_keeping(job: Job, *, default: bool) -> bool:
     """Choose whether signals are stored: as the job says, else those of a single run."""
-    wanted = job.spec.get("keep_signals")  # older jobs do not have it
+    wanted = job.spec["keep_signals"]
     return job.n_runs == 1 or default if wanted is None else bool(wanted)

@@ -285,23 +285,6 @@ def test_a_dispatcher_with_long_leases_counts_as_alive_as_long(database, clock: 
         assert [one.owner for one in repository.list_alive()] == ["slow"]
 
 
-def test_a_dispatcher_of_a_version_without_lease_lengths_disturbs_no_other(
-    database, clock: Clock
-) -> None:
-    with database.write_session() as session:
-        repository = DispatcherRepository(session, clock)
-        repository.add_dispatcher("old", {})
-        repository.add_dispatcher("d1", {LEASE_SECONDS_KEY: 10.0})
-        assert [one.owner for one in repository.list_alive()] == ["d1", "old"]
-    for _ in range(2):
-        submit(database)
-    first, second = (claim(database, owner, clock).job.id for owner in ("d1", "old"))
-    clock.advance(11)
-    assert set(reap_jobs(database, clock).requeued) == {first, second}
-    with database.read_session() as session:
-        assert DispatcherRepository(session, clock).list_alive() == []
-
-
 def test_each_dispatcher_has_its_own_heartbeat_and_leaves_alone(database, clock: Clock) -> None:
     with database.write_session() as session:
         repository = DispatcherRepository(session, clock)
