@@ -108,7 +108,7 @@ class AuditEntryDocument(TypedDict):
     """who did it, as in `GET /v1/access`"""
     action: str
     """what was done, such as `job.submit`"""
-    object_id: str | None
+    object_id: str
     """id of what was changed"""
     request_id: str | None
     """id of the request that did it"""
@@ -844,11 +844,11 @@ class JobDocument(TypedDict):
     """note of a user"""
     tags: NotRequired[list[str]]
     """tags of users"""
-    version: NotRequired[str | None]
+    version: str
     """version of the program that computed the job, or took it"""
     fingerprint: NotRequired[str | None]
     """digest of the kernels' program: equal ones give results equal bit for bit"""
-    spec_hash: NotRequired[str | None]
+    spec_hash: str
     """digest of the request"""
     priority: int
     """jobs of higher priority come first"""

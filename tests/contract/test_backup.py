@@ -15,7 +15,7 @@ from service.core.states import JobState
 from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
 from service.queue.leases import LeaseQueue
 from service.repositories.history import HistoryPoint, pack_history
-from service.repositories.jobs import JobRepository, NewJob
+from service.repositories.jobs import JobRepository
 from service.repositories.references import ReferenceRepository
 from service.storage import migrate
 from service.storage.columns import utc_now
@@ -37,7 +37,7 @@ from service.upkeep import backup
 from service.upkeep.backup import InvalidBackup, TargetInUse, restore_backup, write_backup
 from tests.contract.test_items import add_dataset, edit, end_job
 from tests.database import KINDS, empty_postgres, empty_sqlite
-from tests.stored import Clock, claim, parcels_of, submit
+from tests.stored import Clock, claim, new_job, parcels_of, submit
 
 Rows = dict[str, list[tuple[Any, ...]]]
 
@@ -76,7 +76,7 @@ def filled(database: Database, store: ObjectStore) -> Database:
         insert_missing(session, RunHistory, pack_history([point]))
         state = {"job_id": job, "attempt": 1, "evaluations": 2**40, "state": bytes(range(256))}
         session.add(Checkpoint(run_id=run, **state))
-        JobRepository(session).submit(NewJob("open", {}), key="k")
+        JobRepository(session).submit(new_job("open", {}), key="k")
         DispatcherRepository(session).add_dispatcher("d1", {LEASE_SECONDS_KEY: 30.0})
     return database
 
@@ -106,7 +106,7 @@ def test_a_restored_place_has_the_same_rows_and_objects(
         assert list(job.spec["model"]) == ["z", "name"]  # the order of keys is kept
     with target.write_session() as session:  # further rows are numbered after the restored ones
         last = max(session.scalars(select(Event.id)))
-        JobRepository(session).submit(NewJob("next", {}))
+        JobRepository(session).submit(new_job("next", {}))
         assert max(session.scalars(select(Event.id))) > last
 
 
@@ -175,7 +175,7 @@ def test_a_backup_is_one_state_although_others_write_meanwhile(
     def write_and_let_others_submit(*parts: Any) -> dict[str, Any]:
         def submit() -> None:
             with filled.write_session() as session:
-                JobRepository(session).submit(NewJob("late", {}))
+                JobRepository(session).submit(new_job("late", {}))
 
         thread = threading.Thread(target=submit)
         thread.start()
@@ -199,7 +199,7 @@ def test_a_place_with_rows_or_objects_is_refused_without_force(
     other = open_store(f"file://{tmp_path}/other")
     restore_backup(target, other, file)
     with target.write_session() as session:
-        JobRepository(session).submit(NewJob("mine", {}))
+        JobRepository(session).submit(new_job("mine", {}))
     with pytest.raises(TargetInUse, match=r"rows in .*jobs.*--force"):
         restore_backup(target, open_store(f"file://{tmp_path}/empty"), file)
     restore_backup(target, other, file, force=True)

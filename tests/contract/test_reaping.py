@@ -18,12 +18,22 @@ from service.queue.clocks import choose_database_clock
 from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
 from service.queue.leases import HUNG_AFTER, SPARED_LOSS_FACTOR, LeaseQueue
 from service.queue.orphaned_jobs import Reaper, reap_jobs
-from service.queue.run_writes import NewRun, RunOutcome, RunWriter
+from service.queue.run_writes import RunOutcome, RunWriter
 from service.storage import columns
 from service.storage.columns import utc_now
 from sysid.core.machine import read_machine_id
 from tests.dispatching import until
-from tests.stored import Clock, claim, claimed, job_of, parcel_of, runs_of, state_of, submit
+from tests.stored import (
+    Clock,
+    claim,
+    claimed,
+    job_of,
+    new_run,
+    parcel_of,
+    runs_of,
+    state_of,
+    submit,
+)
 
 LEASE = timedelta(seconds=10)
 
@@ -120,7 +130,7 @@ def test_leases_lost_while_runs_come_to_their_end_are_not_added_up(database, clo
         got = claim(database, "falls", clock)
         with database.write_session() as session:
             ledger = RunWriter(session, got.lease)
-            ledger.create_runs(NewRun(number=i) for i in range(3))
+            ledger.create_runs(new_run(number=i) for i in range(3))
             run = ledger.list_pending()[0].id
             ledger.record_outcomes([RunOutcome(run_id=run, state=JobState.SUCCEEDED, best_rms=1.0)])
         clock.advance(11)
@@ -248,7 +258,7 @@ def test_leases_lost_while_a_run_came_further_are_not_added_up(database, clock: 
         got = claim(database, "falls", clock)
         with database.write_session() as session:
             ledger = RunWriter(session, got.lease)
-            ledger.create_runs([NewRun(number=0)])
+            ledger.create_runs([new_run(number=0)])
             ledger.save_checkpoints([(ledger.list_pending()[0].id, 100 * (number + 1), b"state")])
         clock.advance(11)
         assert reap_jobs(database, clock).requeued == (job,), number
@@ -325,7 +335,7 @@ def save_one(database, got) -> None:
     """Write a checkpoint of a run of the job."""
     with database.write_session() as session:
         ledger = RunWriter(session, got.lease)
-        ledger.create_runs([NewRun(number=0)])
+        ledger.create_runs([new_run(number=0)])
         ledger.save_checkpoints([(ledger.list_pending()[0].id, 100, b"state")])
 
 
