@@ -240,7 +240,7 @@ def _create_jobs() -> None:
         _column("generation", INTEGER),
         _column("seconds_left", REAL, nullable=True),
         _column("error", nullable=True),
-        _column("floors", JSON, nullable=True),
+        _column("cramer_rao", JSON, nullable=True),
         _column("version"),
         _column("fingerprint", nullable=True),
         _column("spec_hash"),

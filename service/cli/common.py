@@ -337,7 +337,7 @@ def format_cell(value: object) -> str:
 
 def format_estimate(estimate: Mapping[str, Any]) -> str:
     """Format an estimate, ``0.1193 ± 0.0004``, from an entry of a run's parameters."""
-    status = str(estimate["status"])
+    status = str(estimate.get("status", ""))
     return plain_estimate(estimate["value"], estimate["stderr"], status=status)
 
 

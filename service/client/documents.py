@@ -662,7 +662,7 @@ class GroupDocument(TypedDict):
     """quantiles, in the output's unit"""
     rms_noise_free: NotRequired[list[float] | None]
     """quantiles of the RMS against the records without added noise"""
-    rms_floor: NotRequired[float | None]
+    rms_cramer_rao_bound: NotRequired[float | None]
     """RMS of estimates at the Cramér–Rao bound: σ√(r/n)"""
     fit_percent: dict[str, list[float] | None]
     """quantiles of the fit, %, by data"""
@@ -1248,8 +1248,8 @@ class ParameterSummaryDocument(TypedDict):
     """value that errors refer to"""
     error: NotRequired[list[float] | None]
     """quantiles of estimate minus reference"""
-    floor: NotRequired[float | None]
-    """Cramér–Rao bound: least standard deviation under the added noise"""
+    cramer_rao_bound: NotRequired[float | None]
+    """least standard deviation under the added noise"""
 
 
 class PointDocument(TypedDict):

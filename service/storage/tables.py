@@ -202,7 +202,7 @@ class Job(Base):
     is that of the parcel that was lost last. `evaluations`, `generation` and `seconds_left` are the
     progress over all runs. `best_rms` is the smallest RMS of any run so far. `fit_estimation` is
     the fit (%) of that run once the job has ended, `trust` that of its verdict; a batch has none.
-    `n_reused` counts the runs taken over from other jobs. `floors` is the document that
+    `n_reused` counts the runs taken over from other jobs. `cramer_rao` is the document that
     `service.dispatch.cramer_rao` computes for a job with noise. `evaluations_before` is the part of
     `evaluations` that was made a day or more before the job was resumed: it does not count for the
     limit of a day.
@@ -281,7 +281,7 @@ class Job(Base):
     generation: Mapped[int] = mapped_column(default=0)
     seconds_left: Mapped[float | None]
     error: Mapped[str | None]
-    floors: Mapped[Document | None]
+    cramer_rao: Mapped[Document | None]
     version: Mapped[str]
     fingerprint: Mapped[str | None]
     spec_hash: Mapped[str]
