@@ -518,7 +518,7 @@ def test_a_downgrade_tells_what_is_lost_and_asks(tmp_path: Path) -> None:
     assert "'0009' is not an earlier revision" in unknown
     assert "base" in unknown
     asked = run_lagid("db", "downgrade", "base", *place)
-    assert "undoes 0001: Create the first tables" in asked.stdout
+    assert "undoes v1: Create the first tables" in asked.stdout
     assert "loses all of its data" in asked.stdout
     assert "--yes" in check_refusal(asked)
     assert "at head" in run_lagid("db", "check", *place).stdout  # nothing was done
