@@ -9,7 +9,7 @@ import re
 import shutil
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from itertools import count
@@ -19,8 +19,9 @@ from typing import Any
 import pytest
 from sqlalchemy import NullPool, create_engine, event, make_url
 
+import migrations
 from service.core.settings import make_sqlite_url
-from service.storage.migrate import upgrade_database
+from service.storage.migrate import find_head_revision, upgrade_database
 from service.storage.sessions import Database
 from service.storage.tables import DEFAULT_PROJECT, Base, Project
 
@@ -162,6 +163,39 @@ def empty_database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[D
     """A database without tables, of both kinds."""
     with empty_sqlite(tmp_path) if request.param == "sqlite" else empty_postgres() as database:
         yield database
+
+
+_NEXT_REVISION = """
+import sqlalchemy as sa
+from alembic import op
+
+revision = "next"
+down_revision = "{head}"
+
+
+def upgrade():
+    op.add_column("projects", sa.Column("copy", sa.String(), nullable=True))
+    op.execute("UPDATE projects SET copy = name")
+    {last}
+
+
+def downgrade():
+    op.drop_column("projects", "copy")
+"""
+
+
+@pytest.fixture
+def add_revision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Add the revision `next` to those of the program, whose upgrade ends with the line `last`."""
+
+    def add(last: str = "") -> None:
+        folder, head = tmp_path / "migrations", find_head_revision()
+        shutil.copytree(Path(migrations.__file__).parent, folder)
+        monkeypatch.setattr(migrations, "__file__", str(folder / "__init__.py"))
+        text = _NEXT_REVISION.format(head=head, last=last)
+        (folder / "versions" / "next.py").write_text(text)
+
+    return add
 
 
 def _admin(url: str, *statements: str) -> None:

@@ -63,7 +63,7 @@ def carried_out(parts: Parts, job: str, steps: int = 5000) -> list[str]:
             claim = LeaseQueue(session).claim_job("test", hour, program=program)
     assert claim is not None
     source = JobRuns(parts.database, claim, parts.store)
-    floors = build_bounds_maker(parts.database, source.parts)
+    cramer_rao = build_bounds_maker(parts.database, source.parts)
     recorder = RunRecorder(
         parts.database, claim, parts.store, source.parts.encoder, source.parts.warm.record_end
     )
@@ -72,7 +72,7 @@ def carried_out(parts: Parts, job: str, steps: int = 5000) -> list[str]:
     for _ in range(steps):
         if feeder.run_step(0.05):
             recorder.write_all()
-            recorder.finish_job(None if floors is None else list(floors())[-1])
+            recorder.finish_job(None if cramer_rao is None else list(cramer_rao())[-1])
             break
     with parts.database.read_session() as session:
         return [run.id for run in RunRepository(session).list_page(job, limit=100).items]

@@ -29,8 +29,12 @@ class Clock:
 
 def submit(database: Database, name: str = "tube", **values) -> str:
     with database.write_session() as session:
-        new = NewJob(name=name, **{"spec": {"model": "tube"}, **values})
+        new = new_job(name, **{"spec": {"model": "tube"}, **values})
         return JobRepository(session).submit(new).job.id
+
+
+def new_job(name: str, spec: dict, **values) -> NewJob:
+    return NewJob(name, spec, **{"version": "0", "spec_hash": "a" * 64, **values})
 
 
 def claim(database: Database, owner: str = "d1", clock: Clock | None = None) -> Claim | None:
@@ -44,8 +48,13 @@ def claimed(database: Database, n_runs: int = 1, **values) -> tuple[Claim, list[
     got = claim(database)
     with database.write_session() as session:
         ledger = RunWriter(session, got.lease)
-        ledger.create_runs(NewRun(number=i, cell={"/seed": i}, seed=i) for i in range(n_runs))
+        ledger.create_runs(new_run(number=i, cell={"/seed": i}, seed=i) for i in range(n_runs))
         return got, [run.id for run in ledger.list_pending(limit=10_000)]
+
+
+def new_run(number: int, **values) -> NewRun:
+    given = {"cell": {}, "labels": {}, "method": "improved", "seed": 1, "sigma": 0.0, **values}
+    return NewRun(number, **given)
 
 
 def record_outcomes(
@@ -100,6 +109,7 @@ def new_dataset(**values) -> NewDataset:
         "duration": 1.0,
         "sample_time": 0.25,
         "channels": [{"name": "u", "unit": "V"}],
+        "details": {"segments": [], "started_at": None, "warnings": []},
         **values,
     }
     return NewDataset(**given)

@@ -38,7 +38,7 @@ def cancel_running(bench: Bench) -> float:
 
 
 def cancel_finishing(bench: Bench) -> float:
-    """Cancel a job whose runs are over, while its floors are made; or soon after."""
+    """Cancel a job whose runs are over, while its bounds are computed; or soon after."""
     return _cancelled(bench, _is_finishing)
 
 

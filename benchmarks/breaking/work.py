@@ -32,7 +32,7 @@ def bodies(dataset: str, size: float = 1.0) -> dict[str, dict[str, Any]]:
     """The jobs, by kind; `size` scales their work.
 
     A sweep; one of which half the cells diverge; a long run on islands; a sweep with runs that
-    kill their workers or take all memory; one to be cancelled, which ends with making floors.
+    kill their workers or take all memory; one to be cancelled, which ends with bounds.
     """
     # Signals of sweeps are kept here, so that faults meet their storage too.
     common = {"model": "duffing-eq16", "datasets": [dataset], "reuse": False, "keep_signals": True}

@@ -47,7 +47,7 @@ class AuditEntryOut(Answer):
     at: datetime = Field(description="when it was done, UTC")
     actor: str = Field(description="who did it, as in `GET /v1/access`")
     action: str = Field(description="what was done, such as `job.submit`")
-    object_id: str | None = Field(description="id of what was changed")
+    object_id: str = Field(description="id of what was changed")
     request_id: str | None = Field(description="id of the request that did it")
 
 

@@ -89,7 +89,7 @@ def run_example(url: str, data_dir: Path, console: Console) -> Path:
         finished = _watch_job(client, job["id"], console)
         runs = {run["cell"]["/algorithm/method"]: run for run in client.runs(job["id"])}
         if finished["state"] != "succeeded":
-            console.print(f"the job {finished['state']}: {finished.get('error')}")
+            console.print(f"the job {finished['state']}: {finished['error']}")
             raise typer.Exit(1)
         _print_table(console, runs)
         report = data_dir / "report.html"
@@ -118,7 +118,7 @@ def _watch_job(client: Client, job: str, console: Console) -> Mapping[str, Any]:
                 method = run["cell"]["/algorithm/method"]
                 if method not in bars:
                     bars[method] = progress.add_task(method, total=1.0, rms="–")
-                rms = run.get("rms")
+                rms = run["rms"]
                 progress.update(
                     bars[method],
                     completed=run["progress"],

@@ -293,7 +293,7 @@ def print_runs(runs: Sequence[Mapping[str, Any]], rms_unit: str | None = None) -
         estimates = {
             parameter["name"]: format_estimate(parameter) for parameter in run["parameters"]
         }
-        fit = run.get("fit_percent") or {}
+        fit = run["fit_percent"] or {}
         rows.append(
             [
                 run["id"],
@@ -325,7 +325,7 @@ def _print_end(client: "Client", job: Mapping[str, Any], as_json: bool) -> None:
         print_run_summary(client, job, runs)
     else:
         print_runs(runs, job["rms_unit"])
-        for warning in dict.fromkeys(w for run in runs for w in run.get("warnings", [])):
+        for warning in dict.fromkeys(w for run in runs for w in run["warnings"]):
             print_note(warning)
     if not as_json:
         print_reuse_note(job, runs, "reuse: false in the job")

@@ -277,7 +277,7 @@ def upgrade_database(data_dir: DataDir = None, as_json: AsJson = False) -> None:
         _print_revision(migrate.read_current_revision(database), as_json)
 
 
-@database_app.command("downgrade", epilog=show_examples("lagid db downgrade 0001"))
+@database_app.command("downgrade", epilog=show_examples("lagid db downgrade v1"))
 def downgrade_database(
     revision: Annotated[str, typer.Argument(help="Earlier revision, or base: no tables at all.")],
     data_dir: DataDir = None,

@@ -232,7 +232,7 @@ def build_sweep_tables(summary: Mapping[str, Any]) -> list[tuple[list[str], list
                 ">success",
                 ">evaluations",
                 f"RMS error{'' if unit in (None, '1') else f' in {unit}'} [5 %, 95 %]",
-                ">floor",
+                ">bound",
             ],
             [[*cell, *_group_cells(group)] for cell, group in zip(cells, groups, strict=True)],
         )
@@ -243,7 +243,7 @@ def build_sweep_tables(summary: Mapping[str, Any]) -> list[tuple[list[str], list
         for name in some:
             headings += [
                 f"{name}{'' if units[name] == '1' else f' in {units[name]}'}: error [5 %, 95 %]",
-                ">floor",
+                ">bound",
             ]
         rows = [
             [*cell, *_error_cells(group, some)] for cell, group in zip(cells, groups, strict=True)
@@ -265,13 +265,13 @@ def _group_cells(group: Mapping[str, Any]) -> list[str]:
 
 def _error_cells(group: Mapping[str, Any], names: list[str]) -> list[str]:
     by_name = {parameter["name"]: parameter for parameter in group["parameters"]}
-    parameters = [by_name.get(name, {"error": None, "floor": None}) for name in names]
+    parameters = [by_name.get(name, {"error": None, "cramer_rao_bound": None}) for name in names]
     return [
         text
         for parameter in parameters
         for text in (
             _format_band(parameter["error"], signed=True),
-            _format_short(parameter["floor"]),
+            _format_short(parameter["cramer_rao_bound"]),
         )
     ]
 

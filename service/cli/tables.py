@@ -73,7 +73,7 @@ def print_run(run: Mapping[str, Any], as_json: bool) -> None:
         print_line(run["error"])
     if run["reused_from"]:
         print_note(REUSE_NOTE.format(run["reused_from"]))
-    for warning in run.get("warnings", []):
+    for warning in run["warnings"]:
         print_note(warning)
 
 
@@ -90,14 +90,14 @@ def print_reuse_note(job: Mapping[str, Any], runs: Sequence[Mapping[str, Any]], 
 
 
 def _format_fit(run: Mapping[str, Any]) -> str:
-    fit = run.get("fit_percent") or {}
+    fit = run["fit_percent"] or {}
     parts = [f"RMS {_format_rms(run, 'rms')}"]
     parts += [
         f"{name} {fit[part]:.2f} %"
         for name, part in (("fit", "estimation"), ("validation fit", "validation"))
         if fit.get(part) is not None
     ]
-    if run.get("rms_validation") is not None:
+    if run["rms_validation"] is not None:
         parts.append(f"validation RMS {_format_rms(run, 'rms_validation')}")
     seconds = "" if run["seconds"] is None else f" in {run['seconds']:.2f} s"
     return f"{', '.join(parts)}; {run['evaluations']} simulations{seconds}"
@@ -131,7 +131,7 @@ def print_run_summary(
     print_line(f"{job['id']}: {len(runs)} runs, {counts}")
     _print_groups(client, job)
     print_line(f"single runs: lagid runs {job['id']}")
-    _print_warning_kinds([warning for run in runs for warning in run.get("warnings", [])])
+    _print_warning_kinds([warning for run in runs for warning in run["warnings"]])
 
 
 def _print_groups(client: "Client", job: Mapping[str, Any]) -> None:

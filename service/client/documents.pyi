@@ -100,7 +100,7 @@ class AuditEntryDocument(TypedDict):
     """who did it, as in `GET /v1/access`"""
     action: str
     """what was done, such as `job.submit`"""
-    object_id: str | None
+    object_id: str
     """id of what was changed"""
     request_id: str | None
     """id of the request that did it"""
@@ -622,7 +622,7 @@ class GroupDocument(TypedDict):
     """quantiles, in the output's unit"""
     rms_noise_free: NotRequired[list[float] | None]
     """quantiles of the RMS against the records without added noise"""
-    rms_floor: NotRequired[float | None]
+    rms_cramer_rao_bound: NotRequired[float | None]
     """RMS of estimates at the Cramér–Rao bound: σ√(r/n)"""
     fit_percent: dict[str, list[float] | None]
     """quantiles of the fit, %, by data"""
@@ -794,11 +794,11 @@ class JobDocument(TypedDict):
     """note of a user"""
     tags: NotRequired[list[str]]
     """tags of users"""
-    version: NotRequired[str | None]
+    version: str
     """version of the program that computed the job, or took it"""
     fingerprint: NotRequired[str | None]
     """digest of the kernels' program: equal ones give results equal bit for bit"""
-    spec_hash: NotRequired[str | None]
+    spec_hash: str
     """digest of the request"""
     priority: int
     """jobs of higher priority come first"""
@@ -1172,8 +1172,8 @@ class ParameterSummaryDocument(TypedDict):
     """value that errors refer to"""
     error: NotRequired[list[float] | None]
     """quantiles of estimate minus reference"""
-    floor: NotRequired[float | None]
-    """Cramér–Rao bound: least standard deviation under the added noise"""
+    cramer_rao_bound: NotRequired[float | None]
+    """least standard deviation under the added noise"""
 
 class PointDocument(TypedDict):
     """Estimate of one quantity at one label."""

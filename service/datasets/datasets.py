@@ -236,7 +236,7 @@ def to_out(row: Dataset) -> DatasetOut:
         row,
         samples=row.n_samples,
         segments=details.pop("segments"),
-        started_at=details.pop("started_at", None),
+        started_at=details.pop("started_at"),
         warnings=details.pop("warnings"),
         tags=row.tags or [],
         details=details,

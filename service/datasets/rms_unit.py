@@ -31,7 +31,7 @@ def find_rms_unit(session: Session, body: JobBody) -> str:
 
 
 def _find_recorded_unit(session: Session, body: JobBody, output: str) -> str:
-    channel = body.get("channels", {}).get(output, output)
+    channel = body["channels"].get(output, output)
     try:
         channels = DatasetRepository(session).get(body["datasets"][0]).channels
     except RowNotFound:

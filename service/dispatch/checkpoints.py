@@ -28,7 +28,7 @@ from sysid.search.state import (
     Migrant,
 )
 
-_HEADER = f"lagid {version('lagid')} run state 2\n".encode()
+_HEADER = f"lagid {version('lagid')} run state 1\n".encode()
 _MAX_BYTES = 2**30
 """Largest state in bytes, so that a damaged checkpoint cannot take all memory."""
 _FLOATS, _WORDS = np.dtype(np.float64), np.dtype(np.uint32)

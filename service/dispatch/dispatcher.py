@@ -330,7 +330,7 @@ class Dispatcher:
 
     def _conclude_job(self, lease: Lease) -> None:
         """End the job of its last parcel, or a parcel that was cancelled or lost."""
-        floors = self._side_jobs.take_result(lease) if lease in self._side_jobs else None
+        cramer_rao = self._side_jobs.take_result(lease) if lease in self._side_jobs else None
         recorder = self._recorders[lease]
         self._forget_parcel(lease)
         if lease in self._lost:
@@ -341,7 +341,7 @@ class Dispatcher:
                 retry_transient(
                     recorder.cancel_parcel
                     if recorder.is_stopped
-                    else partial(recorder.finish_job, floors)
+                    else partial(recorder.finish_job, cramer_rao)
                 )
                 _log.info("%s has ended", lease.job_id)
         except LeaseLost as error:

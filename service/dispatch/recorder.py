@@ -365,17 +365,17 @@ class RunRecorder:
 
         self._begin_batch(batch, run_at_once if is_small else self._run_beside, end)
 
-    def finish_job(self, floors: Document | None = None) -> None:
+    def finish_job(self, cramer_rao: Document | None = None) -> None:
         """Write the last results and end the job, in one transaction.
 
-        All other parcels of the job have ended. With `floors`, all results are already written,
+        All other parcels of the job have ended. With `cramer_rao`, all results are already written,
         because the bounds refer to them.
         """
 
         def end(session: Session) -> None:
             queue = LeaseQueue(session)
-            if floors is not None:
-                queue.write_floors(self.lease, floors)
+            if cramer_rao is not None:
+                queue.write_cramer_rao(self.lease, cramer_rao)
             job = queue.lock_lease(self.lease).job
             complaint = None
             if job.n_failed:

@@ -23,7 +23,7 @@ _METHOD_STYLES: Mapping[str, dict[str, Any]] = {
     "improved": {"color": theme.BLUE, "dash": "solid", "width": 2},
 }
 _OTHER_STYLES = ((theme.GREEN, "solid"), (theme.OCHRE, "dashdot"), (theme.PURPLE, "solid"))
-_FLOOR_STYLE = {"color": theme.GREY, "dash": "dash", "width": 1.6}
+_BOUND_STYLE = {"color": theme.GREY, "dash": "dash", "width": 1.6}
 
 
 @dataclass(slots=True)
@@ -49,7 +49,7 @@ class _Panel:
     title: str
     is_signed: bool
     bands: dict[str, _Band] = field(default_factory=dict)
-    floor: dict[float, float] = field(default_factory=dict)
+    cramer_rao: dict[float, float] = field(default_factory=dict)
 
 
 def noise_group_keys(axes: Sequence[Mapping[str, Any]]) -> list[str] | None:
@@ -92,9 +92,9 @@ def _build_panels(summary: SummaryOut, unit: str) -> list[_Panel]:
             continue
         if group.rms_noise_free is not None:
             _get_band(response, name).add_quantiles(group.sigma, group.rms_noise_free)
-        floor = scale_to_median(group.model_dump())
-        if floor is not None:
-            response.floor[group.sigma] = floor
+        bound = scale_to_median(group.model_dump())
+        if bound is not None:
+            response.cramer_rao[group.sigma] = bound
         for parameter in group.parameters:
             _add_parameter_error(
                 panels.setdefault(parameter.name, _parameter_panel(parameter)),
@@ -110,8 +110,8 @@ def _add_parameter_error(
 ) -> None:
     if parameter.error is not None:
         _get_band(panel, name).add_quantiles(sigma, parameter.error)
-    if parameter.floor is not None:
-        panel.floor[sigma] = parameter.floor
+    if parameter.cramer_rao_bound is not None:
+        panel.cramer_rao[sigma] = parameter.cramer_rao_bound
 
 
 def _parameter_panel(parameter: ParameterSummaryOut) -> _Panel:
@@ -177,7 +177,7 @@ def _add_panel(
         figure["data"] += _band_traces(
             band, label, name, _line_style(name, place_in_order), axis_names, first
         )
-    figure["data"] += _floor_traces(panel, axis_names, in_legend)
+    figure["data"] += _bound_traces(panel, axis_names, in_legend)
     add_caption(figure, panel.caption, domain)
 
 
@@ -225,11 +225,11 @@ def _band_traces(
     ]
 
 
-def _floor_traces(
+def _bound_traces(
     panel: _Panel, axis_names: dict[str, str], in_legend: set[str]
 ) -> list[dict[str, Any]]:
     """Draw the Cramér–Rao bound: for parameters, the 5 and 95 % quantiles that it implies."""
-    x = sorted(panel.floor)
+    x = sorted(panel.cramer_rao)
     if not x:
         return []
     signs = (-QUANTILE_95, QUANTILE_95) if panel.is_signed else (1.0,)
@@ -244,8 +244,8 @@ def _floor_traces(
                 "legendgroup": name,
                 "showlegend": name not in in_legend,
                 "x": to_json_numbers(x),
-                "y": to_json_numbers(sign * panel.floor[sigma] for sigma in x),
-                "line": dict(_FLOOR_STYLE),
+                "y": to_json_numbers(sign * panel.cramer_rao[sigma] for sigma in x),
+                "line": dict(_BOUND_STYLE),
                 **axis_names,
                 "hovertemplate": "bound, σ %{x:.4g}: %{y:.4g}<extra></extra>",
             }

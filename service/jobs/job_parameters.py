@@ -17,7 +17,7 @@ _NUMBERED = re.compile(r"\(0\)\[(\d{1,6})\]$")
 
 def count_experiments(dataset: Dataset) -> int:
     """Count the experiments of a dataset: its segments, or one without segments."""
-    return max(1, len(dataset.details.get("segments") or ()))
+    return max(1, len(dataset.details["segments"]))
 
 
 def list_job_parameters(

@@ -94,9 +94,7 @@ def find_unit_faults(
 def list_record_lengths(dataset: "Dataset") -> list[RecordLength]:
     """List the lengths of a dataset's records: its segments, or the whole dataset."""
     period = dataset.sample_time
-    spans = [
-        segment["stop"] - segment["start"] for segment in dataset.details.get("segments") or []
-    ]
+    spans = [segment["stop"] - segment["start"] for segment in dataset.details["segments"]]
     if not spans:
         return [RecordLength(dataset.duration, dataset.n_samples, period)]
     if period is None:  # samples per segment are not stored: the total suffices

@@ -384,14 +384,12 @@ class JobOut(Answer):
     model: str = Field(description="name of the model")
     note: str | None = Field(default=None, description="note of a user")
     tags: list[str] = Field(default=[], description="tags of users")
-    version: str | None = Field(
-        default=None, description="version of the program that computed the job, or took it"
-    )
+    version: str = Field(description="version of the program that computed the job, or took it")
     fingerprint: str | None = Field(
         default=None,
         description="digest of the kernels' program: equal ones give results equal bit for bit",
     )
-    spec_hash: str | None = Field(default=None, description="digest of the request")
+    spec_hash: str = Field(description="digest of the request")
     priority: int = Field(description="jobs of higher priority come first")
     progress: ProgressOut = Field(description="progress of its runs")
     rms_unit: str | None = Field(

@@ -90,7 +90,7 @@ def _list_dispatchers(session: Session) -> list[DispatcherView]:
             owner=one.owner,
             state=_describe_state(one, is_alive=one.owner in alive),
             is_alive=one.owner in alive,
-            version=str(one.details.get("version", "")),
+            version=one.details["version"],
             cpus=one.details.get("cpus"),
             wanted=one.wanted_cores,
             parcels=parcels.get(one.owner, 0),

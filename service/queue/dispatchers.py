@@ -8,7 +8,6 @@ from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
 from service.queue.clocks import Clock, choose_database_clock
-from service.queue.leases import DEFAULT_LEASE
 from service.storage.columns import Document
 from service.storage.statements import upsert
 from service.storage.tables import DispatcherHeartbeat
@@ -70,7 +69,7 @@ class DispatcherRepository:
         return [
             dispatcher
             for dispatcher in self.list_all()
-            if dispatcher.seen_at >= now - (find_lease_length(dispatcher) or DEFAULT_LEASE)
+            if dispatcher.seen_at >= now - find_lease_length(dispatcher)
         ]
 
 
@@ -85,10 +84,9 @@ def count_wanted_cores(
     }
 
 
-def find_lease_length(dispatcher: DispatcherHeartbeat) -> timedelta | None:
-    """Return the length of the leases of a dispatcher; None if one of another version gave none."""
-    seconds = dispatcher.details.get(LEASE_SECONDS_KEY)
-    return None if seconds is None else timedelta(seconds=seconds)
+def find_lease_length(dispatcher: DispatcherHeartbeat) -> timedelta:
+    """Return the length of the leases of a dispatcher."""
+    return timedelta(seconds=dispatcher.details[LEASE_SECONDS_KEY])
 
 
 StartStep = Literal["ray", "search", "workers"]

@@ -322,10 +322,10 @@ class LeaseQueue:
         self.lock_lease(lease)
         self._events.append_event(lease.job_id, kind, data)
 
-    def write_floors(self, lease: Lease, floors: Document) -> None:
-        """Write the noise bounds to which the runs of the job are compared."""
+    def write_cramer_rao(self, lease: Lease, cramer_rao: Document) -> None:
+        """Write the Cramér–Rao bounds to which the runs of the job are compared."""
         self.lock_lease(lease)
-        self._update_job(lease.job_id, {"floors": floors})
+        self._update_job(lease.job_id, {"cramer_rao": cramer_rao})
 
     def end_parcel(self, lease: Lease) -> bool:
         """End a parcel whose runs have ended; return False if it is the last one of its job.

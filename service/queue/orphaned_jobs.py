@@ -43,9 +43,7 @@ def reap_jobs(
         owners = LeaseOwners(
             ended=frozenset(row.owner for row in rows if is_gone(row.details)),
             awake=frozenset(row.owner for row in rows if is_awake(row.details)),
-            lease_lengths={
-                row.owner: length for row in rows if (length := find_lease_length(row)) is not None
-            },
+            lease_lengths={row.owner: find_lease_length(row) for row in rows},
         )
         if not owners.ended and not LeaseQueue(session, clock).has_expired(owners):
             return ReapResult()

@@ -46,7 +46,6 @@ _RUN_DEFAULTS = {
 
 TEMPORARY_MIB = 32
 """Memory for the temporary tables of a connection, in MiB: what does not fit is written to disk."""
-_NOTHING: Document = {}
 
 
 class NewRun(NamedTuple):
@@ -56,12 +55,11 @@ class NewRun(NamedTuple):
     """
 
     number: int
-    cell: Document = _NOTHING
-    labels: Document = _NOTHING
-    spec_hash: str | None = None
-    method: str | None = None
-    seed: int | None = None
-    sigma: float | None = None
+    cell: Document
+    labels: Document
+    method: str
+    seed: int
+    sigma: float
 
 
 class WaitingRun(NamedTuple):
@@ -360,7 +358,6 @@ _CELL_COLUMNS: Mapping[str, ColumnKind] = {
     "number": "integer",
     "cell": "jsonb",
     "labels": "jsonb",
-    "spec_hash": "text",
     "method": "text",
     "seed": "bigint",
     "sigma": "double precision",

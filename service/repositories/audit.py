@@ -41,7 +41,7 @@ AuditAction = Literal[
 
 
 def record_action(
-    session: Session, action: AuditAction, object_id: str | None, project_id: str | None = None
+    session: Session, action: AuditAction, object_id: str, project_id: str | None = None
 ) -> None:
     """Record an action of the session's owner; it is stored if the transaction commits.
 

@@ -1,7 +1,7 @@
 """The rows of stored recordings. The samples are in the object store."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import select
@@ -43,7 +43,7 @@ class NewDataset:
     duration: float
     sample_time: float | None
     channels: list[Any]
-    details: Document = field(default_factory=dict)
+    details: Document
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,12 +84,10 @@ class DatasetRepository:
             return StoredDataset(existing, False)
         check_stored_bytes(self._session, self._project_id)
         LineageRepository(self._session, self._project_id).add_links(dataset.id, parents, relation)
-        segments = new.details.get("segments") or ()
         labels = [
             term
-            for segment in segments
-            if isinstance(segment, dict)
-            for term in list_label_terms(segment.get("labels") or {})
+            for segment in new.details["segments"]
+            for term in list_label_terms(segment["labels"])
         ]
         add_terms(self._session, "dataset", dataset.id, labels, self._project_id)
         record_action(self._session, "dataset.add", dataset.id, self._project_id)

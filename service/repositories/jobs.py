@@ -59,11 +59,11 @@ class NewJob:
 
     name: str
     spec: Document
+    version: str
+    spec_hash: str
     n_runs: int = 1
     priority: int = 0
     max_attempts: int = 3
-    version: str | None = None
-    spec_hash: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

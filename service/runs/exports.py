@@ -105,8 +105,8 @@ def _build_identified(session: Session, stored: StoredRun) -> IdentifiedModel:
         values,
         _compute_covariance(stored.result, values),
         _find_sample_time(stored, rows),
-        {signal.name: _find_hold(signal.name, stored, rows) for signal in stored.model.inputs},
-        stored.result.get("version") or stored.job.version or "",
+        {signal.name: _find_hold(signal.name, stored) for signal in stored.model.inputs},
+        stored.result["version"],
         _describe_provenance(stored, rows),
         dict(_find_units(stored, rows)),
     )
@@ -174,12 +174,12 @@ def _find_units(stored: StoredRun, rows: list[Dataset]) -> Iterator[tuple[str, s
             yield signal, units.pop()
 
 
-def _find_hold(name: str, stored: StoredRun, rows: list[Dataset]) -> Hold:
-    """Find how the run read an input; earlier versions did not store it in the result."""
-    listed = stored.result.get("input_hold") or ()
-    hold: Hold | None = next((item["chosen"] for item in listed if item["input"] == name), None)
-    channel = next(_find_channels(name, stored, rows), None)
-    return hold or stored.body["hold"].get(name) or (channel or {}).get("hold", "first")
+def _find_hold(name: str, stored: StoredRun) -> Hold:
+    """Find how the run read an input, in the first experiment if they differ."""
+    holds: Iterator[Hold] = (
+        item["chosen"] for item in stored.result["input_hold"] if item["input"] == name
+    )
+    return next(holds)
 
 
 def _describe_provenance(stored: StoredRun, rows: list[Dataset]) -> dict[str, Any]:
@@ -193,8 +193,8 @@ def _describe_provenance(stored: StoredRun, rows: list[Dataset]) -> dict[str, An
         "method": run.method,
         "seed": run.seed,
         "spec_hash": run.spec_hash,
-        "fingerprint": stored.result.get("fingerprint"),
+        "fingerprint": stored.result["fingerprint"],
         "rms": run.best_rms,
-        "fit_percent": stored.result.get("fit_percent"),
+        "fit_percent": stored.result["fit_percent"],
         "datasets": [descriptions.get(name, {"id": name}) for name in stored.body["datasets"]],
     }

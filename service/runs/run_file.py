@@ -97,7 +97,7 @@ def _describe_run(stored: StoredRun, datasets: Mapping[str, Dataset]) -> dict[st
         "labels": run.labels,
         "model": stored.model.document,
         "parameters": [
-            {name: entry.get(name) for name in ("name", "value", "unit", "stderr", "status")}
+            {name: entry[name] for name in ("name", "value", "unit", "stderr", "status")}
             for entry in stored.estimates
         ],
         "datasets": [
@@ -105,7 +105,7 @@ def _describe_run(stored: StoredRun, datasets: Mapping[str, Dataset]) -> dict[st
                 "id": row.id,
                 "sha256": row.sha256,
                 "source": (row.details.get("source") or {}).get("sha256"),
-                "started_at": row.details.get("started_at"),
+                "started_at": row.details["started_at"],
             }
             for row in datasets.values()
         ],
@@ -113,8 +113,8 @@ def _describe_run(stored: StoredRun, datasets: Mapping[str, Dataset]) -> dict[st
         "rms": run.best_rms,
         "seed": run.seed,
         "spec_hash": run.spec_hash,
-        "version": result.get("version") or job.version,
-        "fingerprint": result.get("fingerprint"),
+        "version": result["version"],
+        "fingerprint": result["fingerprint"],
         "reused_from": result.get("reused_from"),
     }
     return {
@@ -130,7 +130,7 @@ def _find_clock(stored: StoredRun, datasets: Mapping[str, Dataset]) -> datetime 
     Segments begin at times of their own.
     """
     rows = list(datasets.values())
-    if len(rows) != 1 or rows[0].details.get("segments"):
+    if len(rows) != 1 or rows[0].details["segments"]:
         return None
-    start = rows[0].details.get("started_at")
+    start = rows[0].details["started_at"]
     return None if start is None else datetime.fromisoformat(start)

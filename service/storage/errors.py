@@ -11,7 +11,7 @@
     - ObjectMissing        the object store has no object of that hash
     - ObjectStoreFailed    the object store did not answer, refused, or is not writable
     - DatabaseNotAtHead    the tables belong to another version of the program
-        - DatabaseIsNewer  that version is a later one, which this program does not know
+        - DatabaseUnknown  this program does not know that version
     - UnknownRevision      there is no migration of that name below the present one
 
 `status` is the HTTP status of the error when it reaches a client.
@@ -124,15 +124,19 @@ class DatabaseNotAtHead(StorageError):
         self.current, self.head = current, head
 
 
-class DatabaseIsNewer(DatabaseNotAtHead):
-    """The tables belong to a later version of the program, which this one does not know."""
+class DatabaseUnknown(DatabaseNotAtHead):
+    """The tables belong to a version of the program that this one does not know.
+
+    That is a later one, or a build from before the first release.
+    """
 
     def __init__(self, current: str, head: str | None) -> None:
         StorageError.__init__(
             self,
-            f"a newer lagid has upgraded the database to revision {current}; this one knows "
-            f"revisions up to {head}. Install the newer version, or run its "
-            f"`lagid db downgrade {head}` first.",
+            f"the database is at revision {current}, and this lagid knows revisions up to {head}. "
+            "If a newer lagid has upgraded it, install that version, or run its "
+            f"`lagid db downgrade {head}` first. Tables of a build before 0.1.0 are not read: name "
+            "a new folder with --data-dir, or another database.",
         )
         self.current, self.head = current, head
 

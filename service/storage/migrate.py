@@ -15,7 +15,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, func, select
 
 import migrations
-from service.storage.errors import DatabaseIsNewer, DatabaseNotAtHead, UnknownRevision
+from service.storage.errors import DatabaseNotAtHead, DatabaseUnknown, UnknownRevision
 from service.storage.sessions import Database
 from service.storage.tables import Base
 
@@ -29,12 +29,12 @@ def upgrade_database(database: Database, revision: str = "head") -> None:
 
     Raises
     ------
-    DatabaseIsNewer
-        If a later version of the program has migrated the database.
+    DatabaseUnknown
+        If the database is at a revision that this program does not know.
     """
     with database.get_waiting_engine(LOCK_WAIT_SECONDS).begin() as connection:
         _lock_migrations(connection)
-        _refuse_newer_database(read_revision(connection))
+        _refuse_unknown_database(read_revision(connection))
         command.upgrade(_make_config(connection), revision)
 
 
@@ -43,12 +43,12 @@ def downgrade_database(database: Database, revision: str = "base") -> None:
 
     Raises
     ------
-    DatabaseIsNewer
-        If a later version of the program has migrated the database: only that one can undo it.
+    DatabaseUnknown
+        If the database is at a revision that this program does not know, so cannot undo.
     """
     with database.get_waiting_engine(LOCK_WAIT_SECONDS).begin() as connection:
         _lock_migrations(connection)
-        _refuse_newer_database(read_revision(connection))
+        _refuse_unknown_database(read_revision(connection))
         command.downgrade(_make_config(connection), revision)
 
 
@@ -57,13 +57,13 @@ def list_undone_migrations(database: Database, revision: str) -> list[tuple[str,
 
     Raises
     ------
-    DatabaseIsNewer
-        If a later version of the program has migrated the database.
+    DatabaseUnknown
+        If the database is at a revision that this program does not know.
     UnknownRevision
         If the revision is not an earlier one of this database. The earliest is ``base``.
     """
     current = read_current_revision(database)
-    _refuse_newer_database(current)
+    _refuse_unknown_database(current)
     if current is None:
         raise UnknownRevision(revision, ())
     done = list(ScriptDirectory.from_config(_make_config()).iterate_revisions(current, "base"))
@@ -94,7 +94,7 @@ def read_current_revision(database: Database) -> str | None:
 def check_revision(database: Database) -> None:
     """Raise `DatabaseNotAtHead` unless the database has the revision of this program."""
     current, needed = read_current_revision(database), find_head_revision()
-    _refuse_newer_database(current)
+    _refuse_unknown_database(current)
     if current != needed:
         raise DatabaseNotAtHead(current, needed)
 
@@ -111,10 +111,9 @@ def read_revision(connection: Connection) -> str | None:
     return MigrationContext.configure(connection).get_current_revision()
 
 
-def _refuse_newer_database(current: str | None) -> None:
-    scripts = ScriptDirectory.from_config(_make_config())
+def _refuse_unknown_database(current: str | None) -> None:
     if current is not None and current not in list_revisions():
-        raise DatabaseIsNewer(current, scripts.get_current_head())
+        raise DatabaseUnknown(current, find_head_revision())
 
 
 def _lock_migrations(connection: Connection) -> None:

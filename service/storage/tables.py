@@ -120,7 +120,7 @@ class AuditEntry(Base):
     at: Mapped[datetime] = mapped_column(default=utc_now)
     actor: Mapped[str]
     action: Mapped[str]
-    object_id: Mapped[str | None]
+    object_id: Mapped[str]
     request_id: Mapped[str | None]
 
 
@@ -202,7 +202,7 @@ class Job(Base):
     is that of the parcel that was lost last. `evaluations`, `generation` and `seconds_left` are the
     progress over all runs. `best_rms` is the smallest RMS of any run so far. `fit_estimation` is
     the fit (%) of that run once the job has ended, `trust` that of its verdict; a batch has none.
-    `n_reused` counts the runs taken over from other jobs. `floors` is the document that
+    `n_reused` counts the runs taken over from other jobs. `cramer_rao` is the document that
     `service.dispatch.cramer_rao` computes for a job with noise. `evaluations_before` is the part of
     `evaluations` that was made a day or more before the job was resumed: it does not count for the
     limit of a day.
@@ -277,14 +277,14 @@ class Job(Base):
     fit_estimation: Mapped[float | None]
     trust: Mapped[str | None]
     evaluations: Mapped[int] = mapped_column(LargeInteger, default=0)
-    evaluations_before: Mapped[int] = mapped_column(LargeInteger, default=0, server_default="0")
+    evaluations_before: Mapped[int] = mapped_column(LargeInteger, default=0)
     generation: Mapped[int] = mapped_column(default=0)
     seconds_left: Mapped[float | None]
     error: Mapped[str | None]
-    floors: Mapped[Document | None]
-    version: Mapped[str | None]
+    cramer_rao: Mapped[Document | None]
+    version: Mapped[str]
     fingerprint: Mapped[str | None]
-    spec_hash: Mapped[str | None]
+    spec_hash: Mapped[str]
     note: Mapped[str | None]
     tags: Mapped[list[Any] | None]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
@@ -356,9 +356,9 @@ class Run(Base):
     cell: Mapped[Document]
     labels: Mapped[Document]
     spec_hash: Mapped[str | None]
-    method: Mapped[str | None]
-    seed: Mapped[int | None] = mapped_column(LargeInteger)
-    sigma: Mapped[float | None]
+    method: Mapped[str]
+    seed: Mapped[int] = mapped_column(LargeInteger)
+    sigma: Mapped[float]
     state: Mapped[JobState] = mapped_column(default=JobState.QUEUED)
     attempt: Mapped[int] = mapped_column(default=0)
     kills: Mapped[int] = mapped_column(default=0)

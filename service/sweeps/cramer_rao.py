@@ -64,10 +64,10 @@ def scale_to_median(group: Mapping[str, Any]) -> float | None:
     is χ² with r degrees of freedom. Its median is below r, so that of the runs may lie below a
     bound of the RMS.
     """
-    if group["rms_floor"] is None:
+    if group["rms_cramer_rao_bound"] is None:
         return None
-    r = sum(parameter["floor"] is not None for parameter in group["parameters"]) or 1
-    return float(group["rms_floor"] * (chi_square_limit(r, 0.5) / r) ** 0.5)
+    r = sum(parameter["cramer_rao_bound"] is not None for parameter in group["parameters"]) or 1
+    return float(group["rms_cramer_rao_bound"] * (chi_square_limit(r, 0.5) / r) ** 0.5)
 
 
 def scale_to_sigma(per_sigma: float | None, sigma: tuple[float, float] | None) -> float | None:

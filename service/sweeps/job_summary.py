@@ -1,9 +1,8 @@
 """What a job says of all its runs: aggregates for pages, figures and tables, and its parameters.
 
 They are computed once for a job that has ended, and stored with it. The dispatcher does this for
-large jobs before it ends them. For others, for cancelled ones and for those of earlier versions the
-first request does. While a job runs, they are remembered for many times the time that they take
-(`service.core.computed`).
+large jobs before it ends them. For others and for cancelled ones the first request does. While a
+job runs, they are remembered for many times the time that they take (`service.core.computed`).
 """
 
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence

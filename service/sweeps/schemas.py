@@ -150,8 +150,8 @@ class ParameterSummaryOut(Answer):
     error: list[float] | None = Field(
         default=None, description="quantiles of estimate minus reference"
     )
-    floor: float | None = Field(
-        default=None, description="Cramér–Rao bound: least standard deviation under the added noise"
+    cramer_rao_bound: float | None = Field(
+        default=None, description="least standard deviation under the added noise"
     )
 
 
@@ -172,7 +172,7 @@ class GroupOut(Answer):
     rms_noise_free: list[float] | None = Field(
         default=None, description="quantiles of the RMS against the records without added noise"
     )
-    rms_floor: float | None = Field(
+    rms_cramer_rao_bound: float | None = Field(
         default=None, description="RMS of estimates at the Cramér–Rao bound: σ√(r/n)"
     )
     fit_percent: dict[str, list[float] | None] = Field(
@@ -199,7 +199,7 @@ class ErrorReferenceOut(Answer):
 class SummaryOut(Answer):
     """Aggregates over the runs of a job.
 
-    References and floors are added when a job with noise has ended.
+    References and Cramér–Rao bounds are added when a job with noise has ended.
     """
 
     job: str = Field(description="identifier of the job")

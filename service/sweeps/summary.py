@@ -27,8 +27,8 @@ RMS, RMS_NOISE_FREE, FIT_ESTIMATION, FIT_VALIDATION = (
 SUCCESS_NOTE = "a run succeeds if it ends with a finite simulation"
 SAFE_LIMIT_NOTE = "a run succeeds if it ends with an RMS within the safe limit"
 BOUND_NOTE = (
-    "floors are Cramér–Rao bounds for the added noise alone. Parameter bounds or an early stop of "
-    "the search can keep errors below them"
+    "Cramér–Rao bounds are those of the added noise alone. Limits of parameters or an early stop "
+    "of the search can keep errors below them"
 )
 
 
@@ -55,26 +55,27 @@ def summarise_job(session: Session, job_id: str, by: Sequence[str] | None) -> Su
         )
     parameters = load_summary(session, job).parameters
     units = {one.name: one.unit for one in parameters if not one.is_fixed}
-    floors = StoredBounds(job.floors)
+    cramer_rao = StoredBounds(job.cramer_rao)
     return SummaryOut(
         job=job.id,
         by=[key.name for key in keys],
         quantiles=[q / 1000 for q in QUANTILES_PER_MILLE],
         groups=[
-            _to_group_out(group, keys, units, floors) for group in load_groups(session, job, groups)
+            _to_group_out(group, keys, units, cramer_rao)
+            for group in load_groups(session, job, groups)
         ],
         runs=job.n_runs,
         reused=job.n_reused,
         rms_unit=find_rms_unit(session, job.spec),
-        references=[_to_reference_out(problem) for problem in floors.problems],
-        notes=list(_list_notes(job, floors)),
+        references=[_to_reference_out(problem) for problem in cramer_rao.problems],
+        notes=list(_list_notes(job, cramer_rao)),
     )
 
 
-def _list_notes(job: Job, floors: StoredBounds) -> Iterator[str]:
+def _list_notes(job: Job, cramer_rao: StoredBounds) -> Iterator[str]:
     yield SUCCESS_NOTE if job.spec["algorithm"]["safe_limit"] is None else SAFE_LIMIT_NOTE
-    if floors.problems:
-        yield from floors.list_notes()
+    if cramer_rao.problems:
+        yield from cramer_rao.list_notes()
         yield BOUND_NOTE
 
 
@@ -106,11 +107,11 @@ def _choose_keys(job: Job, by: Sequence[str] | None) -> list[GroupKey]:
 
 
 def _to_group_out(
-    group: RunGroup, keys: Sequence[GroupKey], units: dict[str, str], floors: StoredBounds
+    group: RunGroup, keys: Sequence[GroupKey], units: dict[str, str], cramer_rao: StoredBounds
 ) -> GroupOut:
     ended = group.states[JobState.SUCCEEDED] + group.states[JobState.FAILED]
     named = {key.name: value for key, value in zip(keys, group.key, strict=True)}
-    problem = floors.find_problem(named) or {}
+    problem = cramer_rao.find_problem(named) or {}
     same = group.sigma is not None and group.sigma[0] == group.sigma[1]
     return GroupOut(
         key=named,
@@ -123,7 +124,7 @@ def _to_group_out(
         seconds=group.mean_seconds,
         rms=_list_quantiles(group, RMS),
         rms_noise_free=_list_quantiles(group, RMS_NOISE_FREE),
-        rms_floor=scale_to_sigma(problem.get("rms"), group.sigma),
+        rms_cramer_rao_bound=scale_to_sigma(problem.get("rms"), group.sigma),
         fit_percent={
             "estimation": _list_quantiles(group, FIT_ESTIMATION),
             "validation": _list_quantiles(group, FIT_VALIDATION),
@@ -136,7 +137,7 @@ def _summarise_parameters(
     group: RunGroup, units: dict[str, str], problem: Mapping[str, Any]
 ) -> Iterator[ParameterSummaryOut]:
     references = (problem.get("reference") or {}).get("values", {})
-    floors = problem.get("stderr", {})
+    bounds = problem.get("stderr", {})
     for name, unit in units.items():
         values = _list_quantiles(group, SummaryQuantity("estimate", name))
         errors = _list_quantiles(group, SummaryQuantity("stderr", name))
@@ -149,7 +150,7 @@ def _summarise_parameters(
                 stderr=None if errors is None else errors[MEDIAN],
                 reference=reference,
                 error=None if reference is None else [value - reference for value in values],
-                floor=scale_to_sigma(floors.get(name), group.sigma),
+                cramer_rao_bound=scale_to_sigma(bounds.get(name), group.sigma),
             )
 
 

@@ -223,15 +223,13 @@ def list_notes(trend: Mapping[str, Any]) -> list[str]:
             by_text.setdefault(text, []).append(f"{label_runs['x']:g}")
     notes += [f"{trend['x']} {', '.join(values)}: {text}" for text, values in by_text.items()]
     if trend["missing"]:
-        notes.append(_describe_missing(trend["missing"], trend.get("failed"), trend.get("unended")))
+        notes.append(_describe_missing(trend["missing"], trend["failed"], trend["unended"]))
     limits = format_limits(trend["quantities"])
     return [*notes, *trend["notes"], *([limits] if limits else [])]
 
 
-def _describe_missing(missing: int, failed: int | None, unended: int | None) -> str:
-    """Describe the runs that are in no table, by the reason; an older server tells none."""
-    if failed is None or unended is None:
-        return f"{format_count(missing)} runs failed or have not ended. They are not in the table"
+def _describe_missing(missing: int, failed: int, unended: int) -> str:
+    """Describe the runs that are in no table, by the reason."""
     others = missing - failed - unended
     reasons = (
         (failed, "failed"),

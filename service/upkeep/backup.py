@@ -55,7 +55,7 @@ _KINDS: Mapping[str, Any] = {
 
 
 class InvalidBackup(StorageError, ValueError):
-    """The file is no backup, is damaged, or was written by a later version of the program."""
+    """The file is no backup, is damaged, or comes from a version that this one does not know."""
 
     def __init__(self, path: Path, reason: str) -> None:
         super().__init__(f"{path} cannot be restored: {reason}")
@@ -127,7 +127,7 @@ def restore_backup(
     Raises
     ------
     InvalidBackup
-        If the file is damaged, or of a later version.
+        If the file is damaged, or of a version that this one does not know.
     TargetInUse
         If the database or the store is not empty, or a dispatcher works on it.
     """
@@ -253,7 +253,7 @@ def _read_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
             path,
             f"lagid {manifest['version']} wrote it, with tables of revision "
             f"{manifest['revision']}; this program knows revisions up to "
-            f"{migrate.find_head_revision()}. Install the newer version",
+            f"{migrate.find_head_revision()}. Restore it with the version that wrote it",
         )
     return manifest
 

@@ -178,7 +178,7 @@ def _purge_job(database: Database, job_id: str) -> int:
         left = exists(select(1).where(Run.job_id == job_id))
         done = update(Job).where(Job.id == job_id, Job.state.not_in(OPEN_STATES), ~left)
         session.execute(
-            done.values(spec={}, floors=null(), purged_at=utc_now()),
+            done.values(spec={}, cramer_rao=null(), purged_at=utc_now()),
             execution_options={"synchronize_session": False},
         )
     return n_runs

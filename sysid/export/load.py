@@ -69,5 +69,5 @@ def _build(document: Mapping[str, Any]) -> IdentifiedModel:
         dict(data["hold"]),
         document["lagid"] or "",
         dict(document["provenance"]),
-        dict(data.get("units", {})),  # absent in files of earlier versions
+        dict(data["units"]),
     )

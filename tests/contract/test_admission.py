@@ -4,9 +4,9 @@ from service.core.states import JobState
 from service.queue.admission import Admission, UnfinishedWork, count_unfinished
 from service.queue.leases import LeaseQueue
 from service.queue.notifications import read_queue_status
-from service.repositories.jobs import JobRepository, NewJob
+from service.repositories.jobs import JobRepository
 from service.storage.tables import Project
-from tests.stored import claim, submit
+from tests.stored import claim, new_job, submit
 
 
 def submit_for(database, project, **values):
@@ -14,7 +14,7 @@ def submit_for(database, project, **values):
         if session.get(Project, project) is None:
             session.add(Project(id=project, name=project))
             session.flush()
-        new = NewJob(name="j", spec={"model": "tube"}, **values)
+        new = new_job(name="j", spec={"model": "tube"}, **values)
         return JobRepository(session, project).submit(new).job.id
 
 

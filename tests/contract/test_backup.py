@@ -1,9 +1,8 @@
 """Backups hold every row and object, and are restored bit for bit: both databases, both stores."""
 
-import json
 import threading
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from service.core.states import JobState
 from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
 from service.queue.leases import LeaseQueue
 from service.repositories.history import HistoryPoint, pack_history
-from service.repositories.jobs import JobRepository, NewJob
+from service.repositories.jobs import JobRepository
 from service.repositories.references import ReferenceRepository
 from service.storage import migrate
 from service.storage.columns import utc_now
@@ -38,7 +37,7 @@ from service.upkeep import backup
 from service.upkeep.backup import InvalidBackup, TargetInUse, restore_backup, write_backup
 from tests.contract.test_items import add_dataset, edit, end_job
 from tests.database import KINDS, empty_postgres, empty_sqlite
-from tests.stored import Clock, claim, parcels_of, submit
+from tests.stored import Clock, claim, new_job, parcels_of, submit
 
 Rows = dict[str, list[tuple[Any, ...]]]
 
@@ -77,7 +76,7 @@ def filled(database: Database, store: ObjectStore) -> Database:
         insert_missing(session, RunHistory, pack_history([point]))
         state = {"job_id": job, "attempt": 1, "evaluations": 2**40, "state": bytes(range(256))}
         session.add(Checkpoint(run_id=run, **state))
-        JobRepository(session).submit(NewJob("open", {}), key="k")
+        JobRepository(session).submit(new_job("open", {}), key="k")
         DispatcherRepository(session).add_dispatcher("d1", {LEASE_SECONDS_KEY: 30.0})
     return database
 
@@ -107,7 +106,7 @@ def test_a_restored_place_has_the_same_rows_and_objects(
         assert list(job.spec["model"]) == ["z", "name"]  # the order of keys is kept
     with target.write_session() as session:  # further rows are numbered after the restored ones
         last = max(session.scalars(select(Event.id)))
-        JobRepository(session).submit(NewJob("next", {}))
+        JobRepository(session).submit(new_job("next", {}))
         assert max(session.scalars(select(Event.id))) > last
 
 
@@ -176,7 +175,7 @@ def test_a_backup_is_one_state_although_others_write_meanwhile(
     def write_and_let_others_submit(*parts: Any) -> dict[str, Any]:
         def submit() -> None:
             with filled.write_session() as session:
-                JobRepository(session).submit(NewJob("late", {}))
+                JobRepository(session).submit(new_job("late", {}))
 
         thread = threading.Thread(target=submit)
         thread.start()
@@ -200,7 +199,7 @@ def test_a_place_with_rows_or_objects_is_refused_without_force(
     other = open_store(f"file://{tmp_path}/other")
     restore_backup(target, other, file)
     with target.write_session() as session:
-        JobRepository(session).submit(NewJob("mine", {}))
+        JobRepository(session).submit(new_job("mine", {}))
     with pytest.raises(TargetInUse, match=r"rows in .*jobs.*--force"):
         restore_backup(target, open_store(f"file://{tmp_path}/empty"), file)
     restore_backup(target, other, file, force=True)
@@ -212,36 +211,21 @@ def test_a_place_with_rows_or_objects_is_refused_without_force(
 
 
 def test_a_backup_of_an_earlier_revision_is_upgraded(
-    empty_database: Database, store: ObjectStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    filled: Database,
+    store: ObjectStore,
+    target: Database,
+    tmp_path: Path,
+    add_revision: Callable[..., None],
 ) -> None:
-    migrate.upgrade_database(empty_database, "0002")
-    tables = Base.metadata.sorted_tables
-    known = {"projects": ["id", "name", "created_at"]}
-    manifest = {
-        "format": 1,
-        "version": "0",
-        "revision": "0002",
-        "missing": [],
-        "tables": {
-            name: {
-                "columns": [[c, "time" if c == "created_at" else "text"] for c in columns],
-                "rows": 1,
-                "sha256": "",
-            }
-            for name, columns in known.items()
-        },
-    }
-    row = json.dumps(["proj_old", "old", "2026-01-01T00:00:00+00:00"]) + "\n"
-    file = tmp_path / "old.zip"
-    monkeypatch.setattr(backup, "_check_table", lambda *_: None)
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr("tables/projects.jsonl", row)
-        archive.writestr("manifest.json", json.dumps(manifest))
-    migrate.downgrade_database(empty_database)
-    restore_backup(empty_database, store, file)
-    assert [one[0] for one in read_rows(empty_database)["projects"]] == ["proj_old"]
-    assert len(read_rows(empty_database)) == len(tables) - 2
-    migrate.check_revision(empty_database)
+    file, other = tmp_path / "b.zip", open_store(f"file://{tmp_path}/other")
+    write_backup(filled, store, file)
+    add_revision()
+    restore_backup(target, other, file)
+    migrate.check_revision(target)
+    assert read_rows(target) == read_rows(filled)
+    restore_backup(target, other, file, force=True)  # the place has the later tables now
+    migrate.check_revision(target)
+    assert read_rows(target) == read_rows(filled)
 
 
 def damage(file: Path, name: str, content: bytes | None) -> None:
@@ -261,7 +245,11 @@ def damage(file: Path, name: str, content: bytes | None) -> None:
     [
         ("manifest.json", None, "no manifest.json"),
         ("manifest.json", b"{}", "format 1"),
-        ("manifest.json", b'{"format": 1, "revision": "9999", "version": "9"}', "lagid 9 wrote it"),
+        (
+            "manifest.json",
+            b'{"format": 1, "revision": "9999", "version": "9"}',
+            "9 wrote it",
+        ),
         ("tables/jobs.jsonl", b"[]\n", "table jobs is damaged"),
         ("tables/jobs.jsonl", None, "no table jobs"),
         ("object", b"other", "object .* is damaged"),

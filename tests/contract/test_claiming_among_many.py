@@ -52,6 +52,8 @@ def add_crowd(database):
             "n_runs": 1,
             "state": state,
             "priority": 0,
+            "version": "0",
+            "spec_hash": "a" * 64,
         }
         for number, state in enumerate(states)
     ]

@@ -36,7 +36,7 @@ def at_once(n, work):
 
 
 def test_a_dataset_is_kept_whole(database):
-    new = new_dataset(details={"segments": [0, 5]}, size_bytes=3 << 32)
+    new = new_dataset(details={"segments": [{"labels": {"x": 5}}]}, size_bytes=3 << 32)
     with database.write_session() as session:
         stored = DatasetRepository(session).add(new)
     with database.read_session() as session:

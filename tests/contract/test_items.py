@@ -19,7 +19,7 @@ from service.queue.reuse import find_computed_runs
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.audit import list_actions
 from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository, NewJob
+from service.repositories.jobs import JobRepository
 from service.repositories.lineage import LineageRepository
 from service.repositories.models import ModelRepository
 from service.repositories.references import ReferenceRepository
@@ -29,7 +29,7 @@ from service.repositories.summaries import read_run_table
 from service.storage.errors import RowNotFound
 from service.storage.sessions import Database, SessionOwner
 from service.storage.tables import DEFAULT_PROJECT, Run, SearchTerm, StoredSummary
-from tests.stored import claimed, job_of, new_dataset, runs_of, submit
+from tests.stored import claimed, job_of, new_dataset, new_job, runs_of, submit
 
 
 def spec_of(dataset: str = "ds_1", **changes: Any) -> dict[str, Any]:
@@ -51,7 +51,7 @@ def add_dataset(database: Database, **values: Any) -> str:
 
 def add_job(database: Database, name: str = "tube", **changes: Any) -> str:
     with database.write_session() as session:
-        job = JobRepository(session).submit(NewJob(name, spec_of(**changes))).job
+        job = JobRepository(session).submit(new_job(name, spec_of(**changes))).job
         store_job_links(session, job)
         return job.id
 
@@ -389,7 +389,7 @@ def test_a_model_is_deleted_by_version_or_whole_and_its_jobs_depend_on_it(
 def test_a_key_of_a_deleted_job_may_be_used_again(database: Database) -> None:
     def send() -> str:
         with database.write_session() as session:
-            return JobRepository(session).submit(NewJob("a", spec_of()), key="k").job.id
+            return JobRepository(session).submit(new_job("a", spec_of()), key="k").job.id
 
     first = send()
     with database.write_session() as session:
@@ -414,7 +414,7 @@ def test_a_dataset_that_is_being_used_cannot_be_deleted_meanwhile(database: Data
     with database.write_session() as session:
         DatasetRepository(session).lock_used([data])
         locked.set()
-        job = JobRepository(session).submit(NewJob("a", spec_of(data))).job
+        job = JobRepository(session).submit(new_job("a", spec_of(data))).job
         store_job_links(session, job)
     thread.join()
     assert deleted == ["HasDependents"]
@@ -441,7 +441,7 @@ def test_a_run_that_is_being_used_cannot_be_deleted_meanwhile(
     with database.write_session() as session:
         JobRepository(session).share_lock(job)
         locked.set()
-        later = JobRepository(session).submit(NewJob("a", spec_of(warm_start=run))).job
+        later = JobRepository(session).submit(new_job("a", spec_of(warm_start=run))).job
         store_job_links(session, later)
     thread.join()
     assert deleted == ["HasDependents"]

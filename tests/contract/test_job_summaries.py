@@ -26,7 +26,7 @@ from tests.results import claim_job, conclude, write_results
 from tests.stored import record_outcomes
 
 AXES = [{"path": "/noise/sigma", "values": [0.1, 0.2]}, {"path": "/seed", "range": [0, 4]}]
-FLOORS = {
+CRAMER_RAO = {
     "axes": [],
     "note": "",
     "problems": [
@@ -67,7 +67,7 @@ def swept(place: Place) -> tuple[str, Lease, list[str]]:
     job = place.submit(sweep={"axes": AXES})
     lease = claim_job(place.database, job)
     with place.database.write_session() as session:
-        LeaseQueue(session).write_floors(lease, FLOORS)
+        LeaseQueue(session).write_cramer_rao(lease, CRAMER_RAO)
     return job, lease, [run.id for run in place.runs(job)]
 
 
@@ -99,11 +99,15 @@ def test_errors_are_from_the_reference_and_bounds_in_proportion_to_one_deviation
     write_results(place.database, lease, results)
     for group, sigma in zip(summarise(place, job).groups, (0.1, 0.2), strict=True):
         (parameter,) = group.parameters
-        assert (group.sigma, group.rms_floor) == (sigma, pytest.approx(3.0 * sigma))
-        assert parameter.floor == pytest.approx(2.0 * sigma)
+        assert (group.sigma, group.rms_cramer_rao_bound) == (sigma, pytest.approx(3.0 * sigma))
+        assert parameter.cramer_rao_bound == pytest.approx(2.0 * sigma)
         assert parameter.error == pytest.approx([value - 0.5 for value in parameter.value])
     (whole,) = summarise(place, job, []).groups
-    assert (whole.sigma, whole.rms_floor, whole.parameters[0].floor) == (None, None, None)
+    assert (whole.sigma, whole.rms_cramer_rao_bound, whole.parameters[0].cramer_rao_bound) == (
+        None,
+        None,
+        None,
+    )
     assert whole.parameters[0].stderr == pytest.approx(0.45)
 
 
@@ -179,9 +183,9 @@ def test_a_dispatcher_stores_what_the_first_reader_would_compute(
         place.database, claim.lease, JobRuns(place.database, claim, place.store).parts
     )
     assert maker is not None
-    *_, floors = maker()
-    assert floors is not None
-    assert floors["axes"] == []
+    *_, cramer_rao = maker()
+    assert cramer_rao is not None
+    assert cramer_rao["axes"] == []
     finish(place, lease)
     stored = summarise_without_runs(place, job)
     with place.database.write_session() as session:

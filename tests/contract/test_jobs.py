@@ -12,7 +12,7 @@ from service.queue.queue_state import read_queue_state
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories import results
 from service.repositories.events import EventRepository
-from service.repositories.jobs import JobRepository, NewJob
+from service.repositories.jobs import JobRepository
 from service.repositories.results import list_results
 from service.repositories.search import ListFilter
 from service.storage.errors import (
@@ -24,9 +24,9 @@ from service.storage.errors import (
 )
 from service.storage.tables import Job, Project, Run
 from tests.database import record_statements
-from tests.stored import claim, claimed, job_of, record_outcomes, runs_of, submit
+from tests.stored import claim, claimed, job_of, new_job, record_outcomes, runs_of, submit
 
-NEW = NewJob(name="tube 40 m", spec={"model": "tube", "sweep": {"axes": []}}, n_runs=3)
+NEW = new_job(name="tube 40 m", spec={"model": "tube", "sweep": {"axes": []}}, n_runs=3)
 
 
 def events(database, job_id, after=0, limit=500):
@@ -56,7 +56,7 @@ def test_a_specification_keeps_the_order_of_its_keys(database):
     parameters = {name: {"lower": 0, "upper": 1} for name in ("zeta", "T", "L", "gain")}
     with database.write_session() as session:
         job = JobRepository(session).submit(
-            NewJob(name="order", spec={"model": {"parameters": parameters}}, n_runs=1)
+            new_job(name="order", spec={"model": {"parameters": parameters}}, n_runs=1)
         )
     found = job_of(database, job.job.id).spec["model"]["parameters"]
     assert list(found) == ["zeta", "T", "L", "gain"]
@@ -318,7 +318,7 @@ def test_another_projects_jobs_are_neither_seen_nor_touched(database):
 @pytest.mark.parametrize("name", ["a\x00b", "\udcff"])
 def test_a_name_that_not_every_database_can_keep_is_refused(database, name):
     with pytest.raises(UnstorableValue), database.write_session() as session:
-        JobRepository(session).submit(NewJob(name=name, spec={}))
+        JobRepository(session).submit(new_job(name=name, spec={}))
 
 
 def test_a_job_tells_its_whole_story(database):

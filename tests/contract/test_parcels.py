@@ -12,7 +12,7 @@ from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.leases import HeldLeases
 from service.queue.leases import Claim, JobProgress, LeaseOwners, LeaseQueue
 from service.queue.notifications import read_queue_status
-from service.queue.run_writes import NewRun, RunOutcome, RunWriter
+from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.errors import LeaseLost, RowConflict
@@ -20,7 +20,7 @@ from service.storage.tables import Checkpoint
 from tests.dispatching import Place, carry_out
 from tests.inline_executor import InlineExecutor
 from tests.results import conclude, write_results
-from tests.stored import job_of, parcels_of, record_outcomes, runs_of, state_of, submit
+from tests.stored import job_of, new_run, parcels_of, record_outcomes, runs_of, state_of, submit
 
 N_RUNS, SIZE = 10, 4
 SMALL = {"population": 8, "generations": 3, "islands": 1, "refine": False}
@@ -40,7 +40,7 @@ def shared(database):
     first, second = claim(database, "d1"), claim(database, "d2")
     for one in (first, second):
         with database.write_session() as session:
-            RunWriter(session, one.lease).create_runs(NewRun(number=n) for n in one.runs)
+            RunWriter(session, one.lease).create_runs(new_run(number=n) for n in one.runs)
     return first, second
 
 
@@ -114,7 +114,7 @@ def test_the_last_parcel_ends_the_job_and_only_it(database, shared):
     first, second = shared
     third = claim(database, "d1")
     with database.write_session() as session:
-        RunWriter(session, third.lease).create_runs(NewRun(number=n) for n in third.runs)
+        RunWriter(session, third.lease).create_runs(new_run(number=n) for n in third.runs)
     for got in (second, third, first):
         end_runs(database, got)
         assert state_of(database, got.job.id) is JobState.RUNNING
@@ -133,7 +133,7 @@ def test_of_parcels_that_end_at_once_exactly_one_is_the_last(database):
         both = [claim(database, owner, 1) for owner in ("d1", "d2")]
         for got in both:
             with database.write_session() as session:
-                RunWriter(session, got.lease).create_runs([NewRun(number=got.runs.start)])
+                RunWriter(session, got.lease).create_runs([new_run(number=got.runs.start)])
             end_runs(database, got)
         start, was_ended = threading.Barrier(2), []
 
@@ -240,7 +240,7 @@ def test_a_job_counts_the_evaluations_of_its_runs_though_its_holder_told_no_prog
     first, second = claim(database, "d1"), claim(database, "d2")
     for got in (first, second):
         with database.write_session() as session:
-            RunWriter(session, got.lease).create_runs(NewRun(number=n) for n in got.runs)
+            RunWriter(session, got.lease).create_runs(new_run(number=n) for n in got.runs)
         ended, begun, *_ = (run.id for run in pending(database, got))
         outcome = RunOutcome(run_id=ended, state=JobState.SUCCEEDED, evaluations=70)
         record_outcomes(database, got.lease, outcome)

@@ -38,10 +38,10 @@ from service.queue.previous_attempts import (
 )
 from service.queue.queue_state import read_queue_state
 from service.queue.reuse import find_computed_runs, take_over_runs
-from service.queue.run_writes import NewRun, RunOutcome, RunWriter, insert_runs
+from service.queue.run_writes import RunOutcome, RunWriter, insert_runs
 from service.repositories.datasets import DatasetRepository
 from service.repositories.events import EventRepository
-from service.repositories.jobs import JobRepository, NewJob
+from service.repositories.jobs import JobRepository
 from service.repositories.lineage import LineageRepository
 from service.repositories.outcomes import read_parameters
 from service.repositories.references import ReferenceRepository
@@ -69,7 +69,7 @@ from service.storage.tables import (
 from service.upkeep.retention import list_deleted_jobs, list_ended_jobs
 from tests.database import record_statements
 from tests.results import conclude, encode_results
-from tests.stored import claimed, new_dataset
+from tests.stored import claimed, new_dataset, new_job, new_run
 
 N_JOBS, N_RUNS, N_EVENTS, N_OTHERS = 3000, 2000, 3000, 2000
 GROWING = {"jobs", "runs", "events", "datasets", "checkpoints", "run_history", "migrations_log"}
@@ -240,9 +240,9 @@ def resolve_alias(statement: str, name: str) -> str:
 
 def submit(at: Filled) -> None:
     with at[0].write_session() as session:
-        new = NewJob(name="new", spec={"model": "tube"})
+        new = new_job(name="new", spec={"model": "tube"})
         job = JobRepository(session).submit(new, key="key", request_hash="h").job
-        insert_runs(session, job, [NewRun(number=0)])
+        insert_runs(session, job, [new_run(number=0)])
         LineageRepository(session).add_links(job.id, ["ds_1"], "estimation")
         count_unfinished(session, DEFAULT_PROJECT)
 
@@ -305,7 +305,7 @@ def count_jobs(at: Filled) -> None:
 def poll_and_claim(at: Filled) -> None:
     admission = Admission(8, 0)
     with at[0].write_session() as session:
-        JobRepository(session).submit(NewJob(name="waits", spec={}))
+        JobRepository(session).submit(new_job(name="waits", spec={}))
     with at[0].read_session() as session:
         assert read_queue_status(session, "d1", admission).has_waiting_job
         read_queue_status(session, "d1")
@@ -347,7 +347,7 @@ def read_next_runs(at: Filled) -> None:
         list_failure_reasons(session, claim.job.id, 3)
         writer = RunWriter(session, claim.lease)
         assert writer.count_runs(range(2)) == 2
-        writer.create_runs(NewRun(number=number) for number in range(2))
+        writer.create_runs(new_run(number=number) for number in range(2))
         assert len(writer.list_pending(2, -1, 2)) == len(ids)
 
 
@@ -362,12 +362,12 @@ def divide_lose_and_end_parcels(at: Filled) -> None:
     """Parcels of a job with many runs, whose evaluations are counted when one is lost or split."""
     database, _, _ = at
     with database.write_session() as session:
-        JobRepository(session).submit(NewJob(name="parcels", spec={}, n_runs=6, priority=100))
+        JobRepository(session).submit(new_job(name="parcels", spec={}, n_runs=6, priority=100))
         queue = LeaseQueue(session)
         first = queue.claim_job("d7", choose_size=lambda _: 4)
         assert first is not None
         writer = RunWriter(session, first.lease)
-        runs = writer.create_runs(NewRun(number=number) for number in range(4))
+        runs = writer.create_runs(new_run(number=number) for number in range(4))
         ended = RunOutcome(run_id=runs[0].id, state=JobState.SUCCEEDED, evaluations=5)
         writer.record_outcomes([ended])
         queue.write_progress(first.lease, JobProgress(5))

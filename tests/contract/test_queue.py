@@ -9,7 +9,7 @@ from sqlalchemy import text
 from service.core.states import JobState
 from service.queue.leases import JobProgress, Lease, LeaseQueue
 from service.queue.notifications import read_queue_status
-from service.queue.run_writes import NewRun, RunOutcome, RunWriter
+from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.errors import LeaseLost, RowConflict
@@ -19,6 +19,7 @@ from tests.stored import (
     claim,
     claimed,
     job_of,
+    new_run,
     parcel_of,
     record_success,
     runs_of,
@@ -253,7 +254,7 @@ def test_an_expired_job_is_queued_again_with_its_unfinished_runs(database, clock
     got = claim(database, "d1", clock)
     with database.write_session() as session:
         ledger = RunWriter(session, got.lease)
-        ledger.create_runs(NewRun(number=i) for i in range(2))
+        ledger.create_runs(new_run(number=i) for i in range(2))
         first, second = (run.id for run in ledger.list_pending())
         ledger.start_runs([first, second])
         ledger.record_outcomes([RunOutcome(run_id=first, state=JobState.SUCCEEDED, best_rms=0.5)])
@@ -292,7 +293,7 @@ def test_a_job_that_loses_its_lease_too_often_fails_and_says_why(database, clock
     assert lose(database, clock)[1].requeued == (job_id,)
     again = claim(database, "silent", clock)
     with database.write_session() as session:
-        RunWriter(session, again.lease).create_runs([NewRun(number=0)])
+        RunWriter(session, again.lease).create_runs([new_run(number=0)])
     clock.advance(11)
     assert reap(database, clock).failed == (job_id,)
     assert [run.state for run in runs_of(database, job_id)] == [JobState.FAILED]

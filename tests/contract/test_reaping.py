@@ -18,12 +18,22 @@ from service.queue.clocks import choose_database_clock
 from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
 from service.queue.leases import HUNG_AFTER, SPARED_LOSS_FACTOR, LeaseQueue
 from service.queue.orphaned_jobs import Reaper, reap_jobs
-from service.queue.run_writes import NewRun, RunOutcome, RunWriter
+from service.queue.run_writes import RunOutcome, RunWriter
 from service.storage import columns
 from service.storage.columns import utc_now
 from sysid.core.machine import read_machine_id
 from tests.dispatching import until
-from tests.stored import Clock, claim, claimed, job_of, parcel_of, runs_of, state_of, submit
+from tests.stored import (
+    Clock,
+    claim,
+    claimed,
+    job_of,
+    new_run,
+    parcel_of,
+    runs_of,
+    state_of,
+    submit,
+)
 
 LEASE = timedelta(seconds=10)
 
@@ -120,7 +130,7 @@ def test_leases_lost_while_runs_come_to_their_end_are_not_added_up(database, clo
         got = claim(database, "falls", clock)
         with database.write_session() as session:
             ledger = RunWriter(session, got.lease)
-            ledger.create_runs(NewRun(number=i) for i in range(3))
+            ledger.create_runs(new_run(number=i) for i in range(3))
             run = ledger.list_pending()[0].id
             ledger.record_outcomes([RunOutcome(run_id=run, state=JobState.SUCCEEDED, best_rms=1.0)])
         clock.advance(11)
@@ -248,7 +258,7 @@ def test_leases_lost_while_a_run_came_further_are_not_added_up(database, clock: 
         got = claim(database, "falls", clock)
         with database.write_session() as session:
             ledger = RunWriter(session, got.lease)
-            ledger.create_runs([NewRun(number=0)])
+            ledger.create_runs([new_run(number=0)])
             ledger.save_checkpoints([(ledger.list_pending()[0].id, 100 * (number + 1), b"state")])
         clock.advance(11)
         assert reap_jobs(database, clock).requeued == (job,), number
@@ -283,23 +293,6 @@ def test_a_dispatcher_with_long_leases_counts_as_alive_as_long(database, clock: 
         repository.add_dispatcher("quick", {LEASE_SECONDS_KEY: 10.0})
         clock.advance(30)
         assert [one.owner for one in repository.list_alive()] == ["slow"]
-
-
-def test_a_dispatcher_of_a_version_without_lease_lengths_disturbs_no_other(
-    database, clock: Clock
-) -> None:
-    with database.write_session() as session:
-        repository = DispatcherRepository(session, clock)
-        repository.add_dispatcher("old", {})
-        repository.add_dispatcher("d1", {LEASE_SECONDS_KEY: 10.0})
-        assert [one.owner for one in repository.list_alive()] == ["d1", "old"]
-    for _ in range(2):
-        submit(database)
-    first, second = (claim(database, owner, clock).job.id for owner in ("d1", "old"))
-    clock.advance(11)
-    assert set(reap_jobs(database, clock).requeued) == {first, second}
-    with database.read_session() as session:
-        assert DispatcherRepository(session, clock).list_alive() == []
 
 
 def test_each_dispatcher_has_its_own_heartbeat_and_leaves_alone(database, clock: Clock) -> None:
@@ -342,7 +335,7 @@ def save_one(database, got) -> None:
     """Write a checkpoint of a run of the job."""
     with database.write_session() as session:
         ledger = RunWriter(session, got.lease)
-        ledger.create_runs([NewRun(number=0)])
+        ledger.create_runs([new_run(number=0)])
         ledger.save_checkpoints([(ledger.list_pending()[0].id, 100, b"state")])
 
 

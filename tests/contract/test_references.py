@@ -6,12 +6,12 @@ import pytest
 
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
-from service.queue.run_writes import NewRun, RunOutcome, RunWriter
+from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.references import ReferenceRepository
 from service.repositories.trends import read_trend_rows
 from service.storage.errors import RowNotFound
 from service.storage.tables import Run
-from tests.stored import claimed, runs_of, submit
+from tests.stored import claimed, new_run, runs_of, submit
 
 RESULT = {
     "parameters": [{"name": "L", "value": 0.1, "stderr": 0.25, "status": "identified"}],
@@ -101,7 +101,7 @@ def test_a_trend_reads_the_runs_that_succeeded_in_order_with_parts_of_their_resu
     with database.write_session() as session:
         lease = LeaseQueue(session).claim_job("d1").lease
         RunWriter(session, lease).create_runs(
-            NewRun(number=i, cell={"/seed": i}, labels={"length_m": 5.0 * i}) for i in range(3)
+            new_run(number=i, cell={"/seed": i}, labels={"length_m": 5.0 * i}) for i in range(3)
         )
     runs = [run.id for run in runs_of(database, lease.job_id)]
     ends = [

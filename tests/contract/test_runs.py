@@ -4,12 +4,12 @@ import pytest
 
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
-from service.queue.run_writes import NewRun, RunOutcome, RunWriter, insert_runs
+from service.queue.run_writes import RunOutcome, RunWriter, insert_runs
 from service.repositories.history import HistoryPoint, MigrantPoint
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.errors import InvalidCursor, RowNotFound, UnstorableValue
-from tests.stored import claimed, job_of, record_outcomes, runs_of, submit
+from tests.stored import claimed, job_of, new_run, record_outcomes, runs_of, submit
 
 RESULT = {
     "parameters": [
@@ -41,7 +41,7 @@ def sweep(database, cells):
     with database.write_session() as session:
         got = LeaseQueue(session).claim_job("d1")
         RunWriter(session, got.lease).create_runs(
-            NewRun(number=i, cell=cell, labels={"length_m": i % 2}) for i, cell in enumerate(cells)
+            new_run(number=i, cell=cell, labels={"length_m": i % 2}) for i, cell in enumerate(cells)
         )
     return got
 
@@ -55,7 +55,7 @@ def test_runs_are_made_in_bulk_and_a_second_time_changes_nothing(database):
     got, before = claimed(database, n_runs=1500)
     with database.write_session() as session:
         ledger = RunWriter(session, got.lease)
-        ledger.create_runs(NewRun(number=i) for i in range(1500))
+        ledger.create_runs(new_run(number=i) for i in range(1500))
         assert [run.id for run in ledger.list_pending(limit=2000)] == before
     assert before == sorted(before)
     assert len(set(before)) == 1500
@@ -65,7 +65,7 @@ def test_runs_can_be_made_with_their_job(database):
     job_id = submit(database)
     with database.write_session() as session:
         job = JobRepository(session).get(job_id)
-        insert_runs(session, job, [NewRun(number=0, cell={"/seed": 3}, seed=3, method="simple")])
+        insert_runs(session, job, [new_run(number=0, cell={"/seed": 3}, seed=3, method="simple")])
     (run,) = runs_of(database, job_id)
     assert (run.job_id, run.project_id, run.seed, run.method) == (
         job_id,

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import NewRun, RunOutcome, RunWriter, insert_runs
-from service.repositories.jobs import JobRepository, NewJob
+from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
 from service.sweeps import table
-from tests.stored import claim
+from tests.stored import claim, new_job, new_run
 
 EVIL = '=HYPERLINK("http://x","y")'
 
@@ -22,7 +22,7 @@ def submit(database: Database, n_runs: int, path: str = "/seed") -> str:
     axes = [{"path": path, "values": values, "labels": None}]
     spec = {"model": "silverbox", "sweep": {"axes": axes}}
     with database.write_session() as session:
-        new = NewJob(name="many", spec=spec, n_runs=n_runs)
+        new = new_job(name="many", spec=spec, n_runs=n_runs)
         return JobRepository(session).submit(new).job.id
 
 
@@ -60,7 +60,7 @@ def rows(database: Database, job: str) -> list[dict[str, str]]:
 
 
 def test_parameters_that_only_late_runs_have_are_in_the_table(database: Database) -> None:
-    cells = [NewRun(number=number) for number in range(1200)]
+    cells = [new_run(number=number) for number in range(1200)]
     job = ended(database, cells, {0: {"K": 2.0}, 3: "no", 1199: {"K": 3.0, "late": 0.1}})
     found = rows(database, job)
     assert len(found) == 1200
@@ -69,17 +69,17 @@ def test_parameters_that_only_late_runs_have_are_in_the_table(database: Database
 
 
 def test_a_table_of_runs_without_estimates_has_no_columns_of_parameters(database: Database) -> None:
-    found = rows(database, ended(database, [NewRun(number=0)], {}))
+    found = rows(database, ended(database, [new_run(number=0)], {}))
     assert [one["state"] for one in found] == ["failed"]
     assert list(found[0])[-2:] == ["error", "/seed"]
 
 
 def test_no_text_of_a_user_is_a_formula_in_a_spreadsheet(database: Database) -> None:
-    cells = [NewRun(number=0), NewRun(number=1)]
+    cells = [new_run(number=0), new_run(number=1)]
     job = ended(database, cells, {0: EVIL, 1: "-2"})
     assert [one["error"] for one in rows(database, job)] == [f"'{EVIL}", "-2"]
     for text in ("+1+cmd|' /C calc'!A0", "-2*K", "@SUM(1)", "\t=1", "\r=1", "\n=1", "\uff1d1"):
-        [row] = rows(database, ended(database, [NewRun(number=0)], {0: text}))
+        [row] = rows(database, ended(database, [new_run(number=0)], {0: text}))
         assert row["error"] == f"'{text}".replace("\r", " ")
 
 
@@ -88,7 +88,7 @@ def estimated(database: Database, job: str, told: Sequence[tuple[str, str, str]]
     got = claim(database)
     assert got is not None
     with database.write_session() as session:
-        insert_runs(session, got.job, [NewRun(number=number) for number in range(len(told))])
+        insert_runs(session, got.job, [new_run(number=number) for number in range(len(told))])
         runs = RunRepository(session).list_page(job).items
         RunWriter(session, got.lease).record_outcomes(
             [

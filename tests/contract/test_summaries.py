@@ -208,15 +208,15 @@ def test_runs_of_a_job_are_not_told_to_another_project(database):
     assert (group.states[JobState.SUCCEEDED], group.quantiles) == (0, {})
 
 
-def test_floors_are_written_under_the_lease_only(database):
+def test_cramer_rao_bounds_are_written_under_the_lease_only(database):
     submit(database, n_runs=1)
     with database.write_session() as session:
         lease = LeaseQueue(session).claim_job("d1").lease
-        LeaseQueue(session).write_floors(lease, {"axes": [], "problems": []})
+        LeaseQueue(session).write_cramer_rao(lease, {"axes": [], "problems": []})
     with database.read_session() as session:
-        assert session.get(Job, lease.job_id).floors == {"axes": [], "problems": []}
+        assert session.get(Job, lease.job_id).cramer_rao == {"axes": [], "problems": []}
     late = Lease(lease.job_id, lease.attempt + 1, "d2")
     with database.write_session() as session, pytest.raises(LeaseLost):
-        LeaseQueue(session).write_floors(late, {"axes": ["late"], "problems": []})
+        LeaseQueue(session).write_cramer_rao(late, {"axes": ["late"], "problems": []})
     with database.read_session() as session:
-        assert session.get(Job, lease.job_id).floors == {"axes": [], "problems": []}
+        assert session.get(Job, lease.job_id).cramer_rao == {"axes": [], "problems": []}

@@ -5,9 +5,9 @@ import pytest
 from service.core.states import JobState
 from service.queue.leases import Claim, LeaseQueue
 from service.queue.reuse import find_computed_runs, take_over_runs
-from service.queue.run_writes import NewRun, RunOutcome, RunWriter
+from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository, NewJob
+from service.repositories.jobs import JobRepository
 from service.repositories.lineage import (
     LineageRepository,
     find_datasets_by_name,
@@ -21,7 +21,7 @@ from service.repositories.trends import read_trend_rows
 from service.storage.errors import RowNotFound
 from service.storage.sessions import SessionOwner, find_database
 from service.storage.tables import DEFAULT_PROJECT, Project
-from tests.stored import job_of, new_dataset
+from tests.stored import job_of, new_dataset, new_job, new_run
 
 OTHER = "proj_other"
 PROJECTS = (DEFAULT_PROJECT, OTHER)
@@ -39,12 +39,12 @@ def shared(database):
 def claimed(database, project: str) -> tuple[Claim, str]:
     """A claimed job of a project with one run."""
     with database.write_session() as session:
-        new = NewJob(name="tube", spec={"model": "tube"})
+        new = new_job(name="tube", spec={"model": "tube"})
         job = JobRepository(session, project).submit(new).job.id
         got = LeaseQueue(session).claim_job("d1")
         assert got.job.id == job
         writer = RunWriter(session, got.lease)
-        writer.create_runs([NewRun(number=0, sigma=0.5)])
+        writer.create_runs([new_run(number=0, sigma=0.5)])
         (run,) = writer.list_pending()
         return got, run.id
 
@@ -177,7 +177,7 @@ def test_sessions_of_an_owner_see_and_write_its_project_alone(shared):
     mine, theirs = (shared.open_for(SessionOwner(project)) for project in PROJECTS)
     with theirs.write_session() as session:
         dataset = DatasetRepository(session).add(new_dataset()).dataset.id
-        job = JobRepository(session).submit(NewJob(name="tube", spec={"model": "tube"})).job.id
+        job = JobRepository(session).submit(new_job(name="tube", spec={"model": "tube"})).job.id
     for reader in (mine, shared):
         with reader.read_session() as session:
             assert DatasetRepository(session).list_page().items == ()

@@ -297,6 +297,7 @@ def _result(rms: float = SIGMA) -> dict[str, Any]:
                 "reason": "",
             }
         ],
+        "verdict": {"trust": "trustworthy", "text": "trustworthy", "reasons": []},
         "warnings": ["T and L have the correlation −0.78: T + L is better known than either"],
     }
 

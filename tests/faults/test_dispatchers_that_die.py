@@ -9,11 +9,11 @@ import pytest
 
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
-from service.queue.run_writes import NewRun, RunOutcome, RunWriter
+from service.queue.run_writes import RunOutcome, RunWriter
 from service.storage.errors import LeaseLost
 from service.storage.sessions import Database
 from tests.limits import LIMIT_SECONDS
-from tests.stored import job_of, runs_of, submit
+from tests.stored import job_of, new_run, runs_of, submit
 
 pytestmark = pytest.mark.slow  # processes of their own
 
@@ -25,7 +25,7 @@ N_JOBS, N_RUNS = 24, 2
 def _work_on(database, claim, trouble):
     with database.write_session() as session:
         ledger = RunWriter(session, claim.lease)
-        ledger.create_runs(NewRun(number=i) for i in range(N_RUNS))
+        ledger.create_runs(new_run(number=i) for i in range(N_RUNS))
         pending = ledger.list_pending()
         ledger.start_runs([run.id for run in pending])
     for run in pending:

@@ -15,14 +15,14 @@ from service.queue.daily_limit import stop_overruns
 from service.queue.leases import JobProgress, Lease, LeaseQueue
 from service.repositories.audit import list_actions
 from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository, NewJob
+from service.repositories.jobs import JobRepository
 from service.repositories.projects import ProjectRepository
 from service.storage.columns import utc_now
 from service.storage.errors import RowConflict, RowNotFound
 from service.storage.sessions import Database, SessionOwner, find_project
 from service.storage.tables import Job
 from tests.database import record_statements
-from tests.stored import claim, job_of, new_dataset, state_of, submit
+from tests.stored import claim, job_of, new_dataset, new_job, state_of, submit
 
 SETTINGS = Settings()
 
@@ -46,7 +46,7 @@ def add_dataset(database: Database, source: str) -> str:
 def add_job(database: Database, **values: object) -> Job:
     """A job of the project with these columns, checked as a submission is."""
     with database.write_session() as session:
-        new = NewJob(name="tube", spec={"model": "tube"})
+        new = new_job(name="tube", spec={"model": "tube"})
         job = JobRepository(session).submit(new).job
         check_limits(session, job, SETTINGS)
         for name, value in values.items():

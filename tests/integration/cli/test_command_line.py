@@ -498,15 +498,16 @@ def test_tables_are_made_and_checked_by_command(tmp_path: Path) -> None:
     assert "at head" in run_lagid("db", "check", "--data-dir", tmp_path).stdout
 
 
-def test_a_database_of_a_newer_lagid_is_one_line_for_every_command(tmp_path: Path) -> None:
+def test_a_database_of_another_lagid_is_one_line_for_every_command(tmp_path: Path) -> None:
     assert run_lagid("db", "upgrade", "--data-dir", tmp_path).code == 0
     with closing(sqlite3.connect(tmp_path / "lagid.db")) as database, database:
         database.execute("UPDATE alembic_version SET version_num = '9999'")
     commands = [("serve", "--no-dispatcher", "--port", 0), ("db", "check"), ("db", "upgrade")]
     for words in (*commands, ("db", "downgrade", "base", "--yes")):
         line = check_refusal(run_lagid(*words, "--data-dir", tmp_path))
-        assert "a newer lagid has upgraded the database to revision 9999" in line
+        assert "the database is at revision 9999" in line
         assert f"`lagid db downgrade {find_head_revision()}`" in line
+        assert "a new folder with --data-dir" in line
 
 
 def test_a_downgrade_tells_what_is_lost_and_asks(tmp_path: Path) -> None:
@@ -517,7 +518,7 @@ def test_a_downgrade_tells_what_is_lost_and_asks(tmp_path: Path) -> None:
     assert "'0009' is not an earlier revision" in unknown
     assert "base" in unknown
     asked = run_lagid("db", "downgrade", "base", *place)
-    assert "undoes 0001: Create the first tables" in asked.stdout
+    assert "undoes v1: Create the first tables" in asked.stdout
     assert "loses all of its data" in asked.stdout
     assert "--yes" in check_refusal(asked)
     assert "at head" in run_lagid("db", "check", *place).stdout  # nothing was done

@@ -100,7 +100,13 @@ def _outcome(run: str, number: int) -> RunOutcome:
         evaluations=100,
         generations=4,
         seconds=0.01,
-        result={"valid": True, "rms": rms, "parameters": values},
+        result={
+            "valid": True,
+            "rms": rms,
+            "parameters": values,
+            "verdict": {"trust": "trustworthy", "text": "trustworthy", "reasons": []},
+            "warnings": [],
+        },
     )
 
 

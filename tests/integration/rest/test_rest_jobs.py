@@ -7,7 +7,7 @@ from starlette.testclient import TestClient
 
 from service.api import event_feed
 from service.core.states import JobState
-from service.queue.dispatchers import DispatcherRepository
+from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunWriter
 from service.repositories.history import HistoryPoint
@@ -51,7 +51,7 @@ def test_a_page_says_that_its_job_waits_for_a_dispatcher(server: TestClient, dat
     page = f"/jobs/{job}"
     assert "This job waits: no dispatcher is alive" in server.get(page).text
     with parts_of(server).database.write_session() as session:
-        DispatcherRepository(session).add_dispatcher("one", {})
+        DispatcherRepository(session).add_dispatcher("one", {LEASE_SECONDS_KEY: 30.0})
     assert "This job waits" not in server.get(page).text
     with parts_of(server).database.write_session() as session:
         DispatcherRepository(session).remove_dispatcher("one")

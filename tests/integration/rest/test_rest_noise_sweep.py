@@ -182,7 +182,7 @@ def test_more_replicates_compute_only_the_new_runs_and_say_so(own: TestClient) -
     assert (other["reused"], other["runs"]) == (6, 12)
 
 
-def test_errors_are_from_the_truth_and_the_floor_grows_in_proportion(server: TestClient) -> None:
+def test_errors_are_from_the_truth_and_the_bound_grows_in_proportion(server: TestClient) -> None:
     _, found = ended(server, sigma=[0, 0.1, 0.2])
     (reference,) = found["references"]
     assert (reference["kind"], reference["note"]) == ("truth", "")
@@ -191,16 +191,18 @@ def test_errors_are_from_the_truth_and_the_floor_grows_in_proportion(server: Tes
     assert any("finite simulation" in note for note in found["notes"])
     quiet, _, noisy, _, loud, _ = found["groups"]
     assert (quiet["sigma"], noisy["sigma"], loud["sigma"]) == (0.0, 0.1, 0.2)
-    assert quiet["rms_floor"] == 0
+    assert quiet["rms_cramer_rao_bound"] == 0
     # Four parameters and the start of y, of 150 samples, all of them told by the data.
-    assert noisy["rms_floor"] == pytest.approx(0.1 * math.sqrt(5 / 150))
+    assert noisy["rms_cramer_rao_bound"] == pytest.approx(0.1 * math.sqrt(5 / 150))
     assert len(noisy["parameters"]) == 5
     for place, one in enumerate(noisy["parameters"]):
         assert one["reference"] == TRUE.get(one["name"], 0.0)  # y starts at zero
         assert one["error"] == [value - one["reference"] for value in one["value"]]
-        assert quiet["parameters"][place]["floor"] == 0
-        assert loud["parameters"][place]["floor"] == pytest.approx(2 * one["floor"])
-        assert one["floor"] > 0
+        assert quiet["parameters"][place]["cramer_rao_bound"] == 0
+        assert loud["parameters"][place]["cramer_rao_bound"] == pytest.approx(
+            2 * one["cramer_rao_bound"]
+        )
+        assert one["cramer_rao_bound"] > 0
 
 
 def test_without_truth_errors_are_from_the_best_run_without_noise(server: TestClient) -> None:
@@ -214,7 +216,7 @@ def test_without_truth_errors_are_from_the_best_run_without_noise(server: TestCl
     assert (reference["kind"], reference["run"]) == ("estimate", best["id"])
     assert reference["parameters"] == {one["name"]: one["value"] for one in best["parameters"]}
     assert any("true values are unknown" in note for note in found["notes"])
-    assert all(one["floor"] > 0 for one in found["groups"][-1]["parameters"])
+    assert all(one["cramer_rao_bound"] > 0 for one in found["groups"][-1]["parameters"])
 
 
 def test_a_truth_of_another_model_is_no_truth(server: TestClient) -> None:
@@ -229,7 +231,7 @@ def test_a_truth_of_another_model_is_no_truth(server: TestClient) -> None:
     assert [one["kind"] for one in apart["references"]] == ["estimate"]
 
 
-def test_each_problem_of_a_sweep_has_a_truth_and_a_floor_of_its_own(server: TestClient) -> None:
+def test_each_problem_of_a_sweep_has_a_truth_and_a_bound_of_its_own(server: TestClient) -> None:
     names = []
     for gain in (2.0, 3.0):
         body = {"name": f"{gain}", "model": "fopdt", **TRUTH, "parameters": {**TRUE, "K": gain}}
@@ -249,12 +251,12 @@ def test_each_problem_of_a_sweep_has_a_truth_and_a_floor_of_its_own(server: Test
         next(one for one in group["parameters"] if one["name"] == "K") for group in found["groups"]
     ]
     assert [one["reference"] for one in gains] == [2.0, 2.0, 3.0, 3.0]
-    assert gains[1]["floor"] > 0
+    assert gains[1]["cramer_rao_bound"] > 0
     together = server.get(f"/v1/jobs/{job}/summary", params={"by": "/noise/sigma"}).json()
     assert all(one["error"] is None for group in together["groups"] for one in group["parameters"])
 
 
-def test_a_job_without_noise_tells_no_floor(server: TestClient) -> None:
+def test_a_job_without_noise_tells_no_bound(server: TestClient) -> None:
     body = {"name": "s", "model": "fopdt", **TRUTH}
     stored = server.post("/v1/datasets:simulate", json=body).json()["id"]
     job = server.post(
@@ -264,7 +266,7 @@ def test_a_job_without_noise_tells_no_floor(server: TestClient) -> None:
     carried_out(parts_of(server), job)
     found = server.get(f"/v1/jobs/{job}/summary").json()
     assert found["references"] == []
-    assert found["groups"][0]["rms_floor"] is None
+    assert found["groups"][0]["rms_cramer_rao_bound"] is None
 
 
 def test_relative_deviations_are_in_those_of_the_output(server: TestClient) -> None:
@@ -279,7 +281,7 @@ def test_relative_deviations_are_in_those_of_the_output(server: TestClient) -> N
     assert runs[-1]["labels"] == {"relative": 0.5}
 
 
-def test_the_figure_has_a_line_a_method_in_each_plot_and_the_floor(server: TestClient) -> None:
+def test_the_figure_has_a_line_a_method_in_each_plot_and_the_bound(server: TestClient) -> None:
     job, found = ended(server)
     figure = server.get(f"/v1/jobs/{job['id']}/figures/summary").json()
     lines = [one for one in figure["data"] if one["mode"] == "lines+markers"]
@@ -293,8 +295,8 @@ def test_the_figure_has_a_line_a_method_in_each_plot_and_the_floor(server: TestC
     drawn = next(one for one in lines if one["name"] == "improved")
     assert drawn["x"] == [0, 0.1]
     assert drawn["y"] == pytest.approx(medians, rel=1e-6)
-    floors = [one for one in figure["data"] if one.get("line", {}).get("dash") == "dash"]
-    assert len(floors) == 1 + 2 * len(names)
+    bounds = [one for one in figure["data"] if one.get("line", {}).get("dash") == "dash"]
+    assert len(bounds) == 1 + 2 * len(names)
     rows = server.get(f"/v1/jobs/{job['id']}/figures/summary?format=csv").text.splitlines()
     assert rows[0] == "series,x,y"
     assert any(row.startswith("improved,0.1,") for row in rows)

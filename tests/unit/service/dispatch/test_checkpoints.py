@@ -64,7 +64,7 @@ class Planted:
 
 def test_a_planted_pickle_is_refused_and_not_run(tmp_path: Path) -> None:
     planted = pickle.dumps(Planted(tmp_path / "ran"))
-    older = HEADER.replace(b"state 2", b"state 1")
+    older = HEADER.replace(b"state 1", b"state 0")
     for data in (planted, HEADER + planted, *(h + zlib.compress(planted) for h in (HEADER, older))):
         with pytest.raises(UnreadableCheckpoint):
             unpack_state(data)

@@ -23,7 +23,7 @@ def group(sigma, method, scale=1.0, **changes):
         stderr=0.1,
         reference=2.0,
         error=error,
-        floor=0.25 * sigma,
+        cramer_rao_bound=0.25 * sigma,
     )
     known = {
         "key": {"/noise/sigma": sigma, "/algorithm/method": method},
@@ -36,7 +36,7 @@ def group(sigma, method, scale=1.0, **changes):
         "seconds": 0.1,
         "rms": quantiles,
         "rms_noise_free": quantiles,
-        "rms_floor": 0.2 * sigma,
+        "rms_cramer_rao_bound": 0.2 * sigma,
         "fit_percent": {},
         "parameters": [parameter],
     }
@@ -156,7 +156,7 @@ def test_what_is_not_known_is_a_dash():
         failed=0,
         evaluations=None,
         rms_noise_free=None,
-        rms_floor=None,
+        rms_cramer_rao_bound=None,
         parameters=[blank],
     )
     first, second = (rows[0] for _, rows in build_sweep_tables(summary([waiting]).model_dump()))
@@ -188,7 +188,7 @@ def test_each_plot_has_a_median_and_a_band_for_each_method():
     assert figure["layout"]["yaxis"]["title"]["text"] == "RMS error [m]"
 
 
-def test_the_floor_of_a_parameter_is_drawn_at_the_quantiles_of_the_band():
+def test_the_bound_of_a_parameter_is_drawn_at_the_quantiles_of_the_band():
     figure = plot_noise_sweep(summary([group(s, "improved") for s in SIGMAS]), "m")
     assert "dash" in SERIES_DASHES
     (response,) = lines(figure, "x", "dash")
@@ -218,7 +218,7 @@ def test_only_a_sweep_over_the_deviation_has_the_figure():
     assert noise_group_keys(axes) == ["/noise/sigma", "/skip"]
 
 
-def test_a_floor_is_told_where_the_runs_of_a_group_have_one_deviation_and_one_problem():
+def test_a_bound_is_told_where_the_runs_of_a_group_have_one_deviation_and_one_problem():
     assert scale_to_sigma(2.0, (0.5, 0.5)) == 1.0
     assert scale_to_sigma(2.0, (0.0, 0.0)) == 0.0
     assert scale_to_sigma(2.0, (0.0, 0.5)) is None

@@ -24,8 +24,6 @@ EMPTY: dict[str, Any] = {"x": "length_m", "quantities": [], "labels": [], "notes
             {"missing": 3, "failed": 0, "unended": 2},
             ["Runs that are not in the table: 2 have not ended, 1 was cancelled or deleted"],
         ),
-        # A server of an earlier version does not divide them.
-        ({"missing": 120}, ["120 runs failed or have not ended. They are not in the table"]),
     ],
 )
 def test_runs_that_are_not_in_the_table_are_counted_by_reason(

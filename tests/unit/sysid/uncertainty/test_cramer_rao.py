@@ -1,4 +1,4 @@
-"""The Cramér–Rao floor: that of a linear model is known, and how it is written changes nothing."""
+"""The Cramér–Rao bound: that of a linear model is known, and how it is written changes nothing."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def problem(document=LINE, skip=0, **options):
 
 
 @pytest.mark.parametrize("skip", [0, 50])
-def test_the_floor_of_a_linear_model_is_that_of_its_regressors(skip):
+def test_the_bound_of_a_linear_model_is_that_of_its_regressors(skip):
     found = cramer_rao_bound(problem(skip=skip), np.array([2.0, 1.0]))
     regressors = np.column_stack([INPUT, np.ones(INPUT.size)])[skip:]
     expected = np.sqrt(np.diag(np.linalg.inv(regressors.T @ regressors)))
@@ -34,7 +34,7 @@ def test_the_floor_of_a_linear_model_is_that_of_its_regressors(skip):
     assert found.response_rms == pytest.approx(np.sqrt(2 / (200 - skip)))
 
 
-def test_bounds_and_scale_of_the_search_do_not_change_the_floor():
+def test_bounds_and_scale_of_the_search_do_not_change_the_bound():
     theta = np.array([2.0, 1.0])
     linear = cramer_rao_bound(problem(), theta)
     changed = {"a": {"lower": 0.5, "upper": 200.0, "scale": "log"}, "b": {"lower": 1.0}}
@@ -59,7 +59,7 @@ def test_a_product_of_which_the_data_tell_no_factor_has_none_but_the_others_keep
     assert found.response_rms == pytest.approx(np.sqrt(2 / 200))
 
 
-def test_no_least_squares_estimate_is_better_than_the_floor_and_its_spread_reaches_it():
+def test_no_least_squares_estimate_is_better_than_the_bound_and_its_spread_reaches_it():
     generator = np.random.default_rng(5)
     regressors = np.column_stack([INPUT, np.ones(INPUT.size)])
     noisy = (regressors @ [2.0, 1.0])[:, None] + 0.3 * generator.standard_normal((200, 4000))
@@ -110,7 +110,7 @@ def test_fewer_samples_than_parameters_tell_none_of_those_they_mix(samples):
     assert np.isinf(found.stderr).all()
 
 
-def test_what_few_samples_tell_by_itself_keeps_its_floor():
+def test_what_few_samples_tell_by_itself_keeps_its_bound():
     document = {
         **LINE,
         "inputs": {},
@@ -127,7 +127,7 @@ def test_what_few_samples_tell_by_itself_keeps_its_floor():
     assert np.isinf([found["b"], found["c"]]).all()
 
 
-def test_the_floor_of_two_outputs_is_that_of_the_noise_that_a_job_adds_to_them():
+def test_the_bound_of_two_outputs_is_that_of_the_noise_that_a_job_adds_to_them():
     """It is drawn for each by itself: were it common, y and w would tell a no better than y."""
     two = {**LINE, "outputs": {"y": "a*u(t) + b + x", "w": "a*u(t) - b + x"}}
     model = parse_model(two)
@@ -151,7 +151,7 @@ def test_the_floor_of_two_outputs_is_that_of_the_noise_that_a_job_adds_to_them()
 
 
 @pytest.mark.parametrize("at_bound", [False, True])
-def test_a_rounded_lag_has_no_floor_and_the_others_keep_theirs(at_bound):
+def test_a_rounded_lag_has_no_bound_and_the_others_keep_theirs(at_bound):
     """The response jumps with it, on both sides or at a bound on one."""
     document = {**LAGGED, "solver": {"interpolation": "nearest"}, "initial": {"x": 0}}
     times = 0.1 * np.arange(100)

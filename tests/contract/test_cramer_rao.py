@@ -1,4 +1,4 @@
-"""Floors of a job with noise: made beside the dispatcher's turns, which no error ends."""
+"""Cramér–Rao bounds of a job: computed beside the dispatcher's turns, which no error ends."""
 
 import threading
 import time
@@ -51,10 +51,10 @@ def carried_out(place, *jobs, meanwhile=lambda: None):
 
 
 def notes(job):
-    return list(StoredBounds(job.floors).list_notes())
+    return list(StoredBounds(job.cramer_rao).list_notes())
 
 
-def test_other_jobs_are_carried_out_while_floors_are_made(place, monkeypatch):
+def test_other_jobs_are_carried_out_while_bounds_are_computed(place, monkeypatch):
     may_go_on, begun = threading.Event(), threading.Event()
     made = cramer_rao_bound
 
@@ -77,10 +77,10 @@ def test_other_jobs_are_carried_out_while_floors_are_made(place, monkeypatch):
     (job,) = carried_out(place, noisy, meanwhile=meanwhile)
     assert states == [JobState.SUCCEEDED, JobState.RUNNING]
     assert job.state is JobState.SUCCEEDED
-    assert job.floors["problems"][0]["stderr"]["T"] > 0
+    assert job.cramer_rao["problems"][0]["stderr"]["T"] > 0
 
 
-def test_a_job_is_cancelled_while_its_floors_are_made(place, monkeypatch):
+def test_a_job_is_cancelled_while_its_bounds_are_computed(place, monkeypatch):
     may_go_on, begun = threading.Event(), threading.Event()
 
     def held(problem, theta):
@@ -99,7 +99,7 @@ def test_a_job_is_cancelled_while_its_floors_are_made(place, monkeypatch):
 
     (job,) = carried_out(place, noisy, meanwhile=meanwhile)
     assert job.state is JobState.CANCELLED
-    assert job.floors is None
+    assert job.cramer_rao is None
     assert {run.state for run in place.runs(noisy)} == {JobState.SUCCEEDED}
 
 
@@ -114,11 +114,11 @@ def test_an_error_of_the_numerics_is_a_note_and_the_job_succeeds(place, monkeypa
     assert any("no Cramér–Rao bound: internal error" in one for one in notes(job))
 
 
-def test_of_more_problems_than_floors_are_made_of_a_note_tells(place, monkeypatch):
+def test_of_more_problems_than_bounds_are_computed_of_a_note_tells(place, monkeypatch):
     monkeypatch.setattr(cramer_rao, "MAX_PROBLEMS", 2)
     (few,) = carried_out(place, place.submit(**NOISY, sweep={"axes": [SKIPS[0]]}))
     (many,) = carried_out(place, place.submit(**NOISY, sweep={"axes": [SKIPS[1]]}))
-    assert [len(job.floors["problems"]) for job in (few, many)] == [2, 2]
+    assert [len(job.cramer_rao["problems"]) for job in (few, many)] == [2, 2]
     assert [cramer_rao.LEFT_OUT_NOTE in notes(job) for job in (few, many)] == [False, True]
 
 
