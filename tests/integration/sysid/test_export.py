@@ -328,8 +328,9 @@ GATE: dict[Hold, set[str]] = {
     "zero": {
         *("actuator", "mackey_glass", "narx", "silverbox"),
         *("rk4", "rk4_own_step", "euler_nearest", "euler_cubic", "semi_implicit"),
-        *("names", "tables", "functions", "selected", "history", "history_own_step"),
-        *("flow", "recursion", "recursion_cubic", "recursion_nearest", "recursion_of_flow"),
+        *("names", "tables", "functions", "selected", "flow"),
+        *("history", "history_own_step", "history_semi_implicit"),
+        *("recursion", "recursion_cubic", "recursion_nearest", "recursion_of_flow"),
         *("recursion_of_names", "start_of_recursion", "steady", "steady_off_samples"),
     },
     "first": {"duffing_eq16", "rk4_linear", "flow_substeps", "history_linear", "recursion"},
