@@ -97,17 +97,6 @@ def test_a_constant_output_is_fitted_and_the_fit_is_said_to_be_none(
     assert any("worse than a straight line" in one for one in run["warnings"])
 
 
-def test_fewer_scored_samples_than_parameters_are_refused(
-    parts: tuple[TestClient, Parts],
-) -> None:
-    client, _ = parts
-    fields = {"skip": 208, "validation": {"fraction": 0.3}}
-    body = {"model": FIRST, "datasets": [store_csv(client, recording())], **fields}
-    (fault,) = refused(client.post("/v1/jobs", json=body), 422, "invalid")
-    assert fault["pointer"] == "/datasets"
-    assert "2 scored samples for 3 free parameters" in fault["detail"]
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
