@@ -31,7 +31,8 @@ _OPERATORS: Mapping[str, Callable[[Any, Any], Any]] = {
 }
 
 
-def _pchip(at: float, x: FloatArray, y: FloatArray) -> float:
+def interpolate_pchip(at: float, x: FloatArray, y: FloatArray) -> float:
+    """Interpolate by the definition of the library, held beyond the ends."""
     return float(PchipInterpolator(x, y)(np.clip(at, x[0], x[-1])))
 
 
@@ -57,7 +58,7 @@ FUNCTIONS: Mapping[str, Callable[..., float]] = {
     "floor": lambda x: float(math.floor(x)),
     "mod": lambda x, y: x % y,
     "table": lambda at, *points: float(np.interp(at, *np.reshape(points, (2, -1)))),
-    "pchip": lambda at, *points: _pchip(at, *np.reshape(points, (2, -1))),
+    "pchip": lambda at, *points: interpolate_pchip(at, *np.reshape(points, (2, -1))),
     "clip": lambda x, lower, upper: min(max(x, lower), upper),
 }
 

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from math import floor
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 
 from sysid.core.types import FloatArray
 from sysid.data.interpolation import FineInput
@@ -23,6 +22,7 @@ from sysid.models.model import (
 )
 from sysid.simulation.experiments import GridExperiment
 from sysid.simulation.problem import Problem
+from tests.meaning import interpolate_pchip
 
 _FUNCTIONS = {
     "sin": np.sin,
@@ -46,12 +46,8 @@ _FUNCTIONS = {
     "mod": np.mod,
     "clip": np.clip,
     "table": lambda at, *points: np.interp(at, *np.reshape(points, (2, -1))),
-    "pchip": lambda at, *points: _pchip(at, *np.reshape(points, (2, -1))),
+    "pchip": lambda at, *points: interpolate_pchip(at, *np.reshape(points, (2, -1))),
 }
-
-
-def _pchip(at: float, x: FloatArray, y: FloatArray) -> float:
-    return float(PchipInterpolator(x, y)(np.clip(at, x[0], x[-1])))
 
 
 _OPERATORS = {

@@ -1,8 +1,8 @@
 """Two nodes of one Ray cluster, in processes of their own: the session's local Ray is not touched.
 
-Run as ``python -m tests.two_nodes FOLDER TEMPORARY``: it starts a head and another node of one
-CPU each, prints the address, and obeys lines on standard input: ``kill`` (kill -9 of all of the
-second node), ``add`` (one more node), ``end``.
+Run as ``python -m tests.two_nodes FOLDER TEMPORARY``.
+It starts a head and another node of one CPU each, prints the address, and obeys lines on standard
+input: ``kill`` (kill -9 of all of the second node), ``add`` (one more node), ``end``.
 """
 
 import os

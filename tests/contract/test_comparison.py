@@ -1,7 +1,5 @@
 """Comparison of stored results: best first, and only on the same data."""
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,13 +9,6 @@ from service.runs.comparison import compare_runs
 from service.runs.schemas import ComparisonOut
 from tests.dispatching import Place
 from tests.results import claim_job, conclude, write_results
-
-
-@pytest.fixture
-def place(tmp_path: Path) -> Iterator[Place]:
-    made = Place(tmp_path / "data")
-    yield made
-    made.database.dispose()
 
 
 def identified(

@@ -12,7 +12,6 @@ from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.leases import HeldLeases
 from service.sweeps.cramer_rao import StoredBounds
 from sysid.uncertainty.cramer_rao import cramer_rao_bound
-from tests.dispatching import Place
 from tests.inline_executor import InlineExecutor
 from tests.limits import LIMIT_SECONDS
 
@@ -20,13 +19,6 @@ pytestmark = pytest.mark.slow
 
 SMALL = {"population": 8, "generations": 3, "islands": 1, "refine": False}
 NOISY = {"algorithm": SMALL, "noise": {"sigma": 0.1}}
-
-
-@pytest.fixture
-def place(tmp_path):
-    made = Place(tmp_path / "data")
-    yield made
-    made.database.dispose()
 
 
 def carried_out(place, *jobs, meanwhile=lambda: None):

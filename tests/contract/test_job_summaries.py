@@ -42,12 +42,6 @@ CRAMER_RAO = {
 
 
 @pytest.fixture
-def place(tmp_path: Path, sqlite_database: Database) -> Place:
-    """For what is computed, whichever database keeps it."""
-    return Place(tmp_path / "data", sqlite_database)
-
-
-@pytest.fixture
 def stored_place(tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch) -> Place:
     """A place where the summaries of all jobs are stored, and none is remembered."""
     monkeypatch.setattr(job_summary, "STORED_RUNS", 1)

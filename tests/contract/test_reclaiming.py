@@ -13,7 +13,6 @@ from service.repositories.history import HistoryPoint, MigrantPoint
 from service.repositories.runs import RunRepository
 from service.storage.tables import Checkpoint
 from sysid.identification.run import begin_run
-from tests.dispatching import Place
 from tests.runs import RECORDS, encode_runs, spec
 from tests.searching import bits
 from workers.protocol import QueuedRun, RunFailure
@@ -25,13 +24,6 @@ SWEEP = {"axes": [{"path": "/seed", "values": [1, 2, 3, 4]}]}
 @pytest.fixture(scope="module")
 def state():
     return begin_run(build_pack_problems(spec().problem, RECORDS)[0], spec().algorithm, 1)
-
-
-@pytest.fixture
-def place(tmp_path):
-    made = Place(tmp_path / "data")
-    yield made
-    made.database.dispose()
 
 
 def claim(place):

@@ -10,7 +10,7 @@ from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.errors import ObjectStoreFailed
 from service.storage.garbage import delete_orphans
-from tests.dispatching import Place, carry_out
+from tests.dispatching import carry_out
 from tests.inline_executor import InlineExecutor
 from workers import tasks
 
@@ -29,13 +29,6 @@ class CountingExecutor(InlineExecutor):
     def submit_pack(self, pack):
         self.computed += [item.run for item in pack.items]
         return super().submit_pack(pack)
-
-
-@pytest.fixture
-def place(tmp_path):
-    made = Place(tmp_path / "data")
-    yield made
-    made.database.dispose()
 
 
 def sweep(seeds, **changes):

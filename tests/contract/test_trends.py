@@ -1,7 +1,6 @@
 """Trends of stored results: each label is compared with its own reference, at a common limit."""
 
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -23,13 +22,6 @@ from tests.results import claim_job, conclude, write_results
 from tests.stored import parcel_of, record_outcomes
 
 LENGTHS = (1.0, 2.0, 4.0)
-
-
-@pytest.fixture
-def place(tmp_path: Path) -> Iterator[Place]:
-    made = Place(tmp_path / "data")
-    yield made
-    made.database.dispose()
 
 
 def batch(

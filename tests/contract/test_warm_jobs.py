@@ -18,7 +18,7 @@ from service.queue.leases import LeaseQueue
 from service.storage.tables import Run
 from sysid.core.errors import InvalidSettings
 from sysid.data.noise import Noise
-from tests.dispatching import Place, carry_out
+from tests.dispatching import carry_out
 from tests.inline_executor import InlineExecutor
 from workers.protocol import RunNotReady
 
@@ -37,13 +37,6 @@ class KeepingExecutor(InlineExecutor):
     def submit_pack(self, pack):
         self.warm.update({item.run: item.spec.warm_starts for item in pack.items})
         return super().submit_pack(pack)
-
-
-@pytest.fixture
-def place(tmp_path):
-    made = Place(tmp_path / "data")
-    yield made
-    made.database.dispose()
 
 
 def carried_out(place, slots=1, **body):

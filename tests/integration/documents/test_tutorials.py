@@ -14,7 +14,16 @@ def describe(outputs: list[Output]) -> str:
     return "\n".join(f"on the page:\n{one.written}\nnow:\n{one.seen}" for one in outputs)
 
 
-@pytest.mark.parametrize("page", WITHOUT_SERVICE, ids=lambda page: page.stem)
+LONG = {"dead_time_in_transfer_functions"}  # as much computing as all the others: at night
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=page.stem, marks=[pytest.mark.night] if page.stem in LONG else [])
+        for page in WITHOUT_SERVICE
+    ],
+)
 def test_a_tutorial_prints_what_it_shows(page: Path) -> None:
     differing = check_page(page)
     assert differing == [], describe(differing)

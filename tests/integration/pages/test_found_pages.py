@@ -28,18 +28,8 @@ from sysid.data.records import Channel, Recording
 from sysid.figures.data import ExperimentTraces, OutputTraces, SignalTrace
 from sysid.figures.signals import plot_comparison
 from sysid.models.catalogue.load import copy_catalogue_document
-from tests.e2e.filled import Filled, copy_filled
+from tests.e2e.filled import Filled
 from tests.rest import parts_of, settings_of
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("pages")
-
-
-@pytest.fixture(scope="module")
-def filled(folder: Path) -> Filled:
-    return copy_filled(folder)
 
 
 @pytest.fixture(scope="module")

@@ -14,18 +14,8 @@ from service.datasets.datasets import add_recording
 from service.pages import render
 from service.storage.tables import Job
 from sysid.data.records import Channel, Recording
-from tests.e2e.filled import Filled, copy_filled
+from tests.e2e.filled import Filled
 from tests.rest import parts_of, settings_of
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("pages")
-
-
-@pytest.fixture(scope="module")
-def filled(folder: Path) -> Filled:
-    return copy_filled(folder)
 
 
 @pytest.fixture(scope="module")

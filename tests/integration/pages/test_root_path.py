@@ -11,21 +11,11 @@ from starlette.testclient import TestClient
 from service.api.app import create_app
 from service.core.settings import Settings
 from service.pages.render import STATIC_FOLDER
-from tests.e2e.filled import Filled, copy_filled
+from tests.e2e.filled import Filled
 from tests.rest import CSV, recording, settings_of
 
 ROOT_PATH = "/tools/lagid"
 ADDRESSES = re.compile(r'(?:href|src|action|data-url|data-profile)="(/[^"]*)"')
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("root")
-
-
-@pytest.fixture(scope="module")
-def filled(folder: Path) -> Filled:
-    return copy_filled(folder)
 
 
 @pytest.fixture(scope="module")

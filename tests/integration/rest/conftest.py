@@ -7,6 +7,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
+from tests.batches import ServedBatch, serve_batch
 from tests.rest import recording, settings_of, store_csv
 
 
@@ -29,3 +30,10 @@ def own(tmp_path: Path) -> Iterator[TestClient]:
     """An application of the test's own."""
     with TestClient(create_app(settings_of(tmp_path)), raise_server_exceptions=False) as client:
         yield client
+
+
+@pytest.fixture(scope="module")
+def served_batch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedBatch]:
+    """An application that has the batch of tubes."""
+    with serve_batch(tmp_path_factory.mktemp("batch")) as batch:
+        yield batch

@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,7 +9,6 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner, Result
 
-from service.api.app import create_app
 from service.cli import common
 from service.cli.common import FieldOrigins
 from service.cli.main import build_program
@@ -19,7 +17,7 @@ from service.client.calls import ProblemError
 from service.client.client import Client
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
-from tests.rest import recording, settings_of, store_csv
+from tests.rest import parts_of, recording, store_csv
 
 MODEL: dict[str, Any] = {
     "name": "lagged",
@@ -45,25 +43,23 @@ class Served(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    app = create_app(settings_of(tmp_path_factory.mktemp("shown")))
-    with TestClient(app) as server:
-        data = store_csv(server, recording())
-        axis = {
-            "path": "/datasets",
-            "values": [[data], [data]],
-            "labels": [{"length_m": 5}, {"length_m": 20}],
-        }
-        body = {
-            "model": MODEL,
-            "datasets": [data],
-            "sweep": {"axes": [axis]},
-            "algorithm": {"population": 20, "generations": 40, "islands": 1},
-            "hold": {"u": "zero"},
-            "validation": {"fraction": 0.2},
-        }
-        job, runs = identified(app.state.parts, body)
-        yield Served(Client("http://testserver", transport=Through(server)), data, job, runs)
+def served(server: TestClient) -> Served:
+    data = store_csv(server, recording())
+    axis = {
+        "path": "/datasets",
+        "values": [[data], [data]],
+        "labels": [{"length_m": 5}, {"length_m": 20}],
+    }
+    body = {
+        "model": MODEL,
+        "datasets": [data],
+        "sweep": {"axes": [axis]},
+        "algorithm": {"population": 20, "generations": 40, "islands": 1},
+        "hold": {"u": "zero"},
+        "validation": {"fraction": 0.2},
+    }
+    job, runs = identified(parts_of(server), body)
+    return Served(Client("http://testserver", transport=Through(server)), data, job, runs)
 
 
 @pytest.fixture(autouse=True)

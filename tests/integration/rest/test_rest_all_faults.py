@@ -1,5 +1,6 @@
 """One answer has every fault of types; if there is none, every fault of what the fields mean."""
 
+from itertools import product
 from typing import Any
 
 import pytest
@@ -36,25 +37,12 @@ def faults(answer: Any) -> dict[str, str]:
             {"seed": "x", "parameters": {"LL": {"upper": 1}, "K": {"upper": "x"}}},
             {"/seed", "/parameters/K/upper"},
         ),
-        ({"model": "fopd", "seed": "x"}, {"/seed"}),
         ({"model": 3, "datasets": ["none"], "algoritm": {}}, {"/model", "/algoritm"}),
-        (
-            {"algorithm": {"populaton": 3, "mutation": 3}, "hold": {"y": "zero"}},
-            {"/algorithm/populaton", "/algorithm/mutation"},
-        ),
-        ({"datasets": 3, "parameters": {"LL": {"upper": 1}}}, {"/datasets"}),
         (
             {"sweep": {"axes": [{"values": [1]}]}, "trend": {"x": "n", "parameters": ["LL"]}},
             {"/sweep/axes/0/path"},
         ),
-        ({"validation": {"fraction": 2}, "skip": 10_000}, {"/validation/fraction"}),
-        (
-            {"priority": "high", "sweep": {"axes": [{"path": "/noise/sigma", "values": [0, -1]}]}},
-            {"/priority"},
-        ),
         ({"channels": {"u": 3}, "hold": {"y": "zero", "u": "held"}}, {"/channels/u", "/hold/u"}),
-        ({"chanels": {"u": "volts"}, "skip": 10_000}, {"/chanels"}),
-        ({"seed": [], "sweep": {"axes": [{"path": "/seed", "range": [0, 900_000]}]}}, {"/seed"}),
     ],
 )
 def test_a_job_with_faults_of_types_is_told_all_of_these_and_no_others(
@@ -73,10 +61,6 @@ def test_a_job_with_faults_of_types_is_told_all_of_these_and_no_others(
         ),
         ({"model": "fopd", "datasets": ["none"]}, {"/model", "/datasets/0"}),
         (
-            {"algorithm": {"mutation": [[5, 0.2]]}, "hold": {"y": "zero"}},
-            {"/algorithm/mutation", "/hold/y"},
-        ),
-        (
             {
                 "channels": {"w": "u"},
                 "sweep": {"axes": [{"path": "/sed", "range": [0, 2]}]},
@@ -88,11 +72,6 @@ def test_a_job_with_faults_of_types_is_told_all_of_these_and_no_others(
             {"sweep": {"axes": [{"path": "/seed", "range": [0, 900_000]}]}, "hold": {"y": "zero"}},
             {"/sweep/axes", "/hold/y"},
         ),
-        (
-            {"trend": {"x": "n", "parameters": ["LL"]}, "weights": {"z": 1}},
-            {"/trend/x", "/trend/parameters/0", "/weights/z"},
-        ),
-        ({"skip": 10_000, "hold": {"y": "zero"}}, {"/datasets/0", "/hold/y"}),
         (
             {"channels": {"u": "volts"}, "parameters": {"L": {"lower": 9, "upper": 5}}},
             {"/channels/u", "/parameters/L"},
@@ -129,11 +108,6 @@ def test_a_job_of_right_types_is_told_all_its_faults_and_none_that_follows_from_
         (
             {"datasets": True, "sigma": [-1], "replicates": 0, "parameters": {"LL": {"upper": 1}}},
             {"/sigma/0", "/replicates"},
-        ),
-        ({"truth": {**TRUTH, "samples": "x"}, "hold": {"y": "zero"}}, {"/truth/samples"}),
-        (
-            {"truth": TRUTH, "hold": {"y": "zero"}, "algorithm": {"method": "simple"}},
-            {"/algorithm/method", "/hold/y"},
         ),
         (
             {"truth": {**TRUTH, "inputs": {}}, "hold": {"y": "zero"}, "replicates": 100_001},
@@ -216,17 +190,22 @@ def test_a_batch_is_told_its_faults_of_types_else_all_others(
     assert set(found) == {"/warm_start", "/trend_parameters/0", "/parameters/LL"}
 
 
-@pytest.mark.parametrize("path", ["/v1/jobs", "/v1/recipes/noise-sweep", "/v1/datasets:simulate"])
-@pytest.mark.parametrize("others", ["", '"seed": "x", "skip": -1,'])
-@pytest.mark.parametrize("depth", [60, 300, 600, 900, 960, 990])
+@pytest.mark.parametrize(
+    ("path", "others"),
+    [
+        ("/v1/jobs", ""),
+        ("/v1/jobs", '"seed": "x", "skip": -1,'),
+        ("/v1/recipes/noise-sweep", ""),
+        ("/v1/datasets:simulate", ""),
+    ],
+)
 @pytest.mark.parametrize("nested", [("[", "]"), ('{"a":', "}")])
 def test_a_body_that_is_nested_too_deeply_is_refused_wherever_that_is(
-    server: TestClient, path: str, others: str, depth: int, nested: tuple[str, str]
+    server: TestClient, path: str, others: str, nested: tuple[str, str]
 ) -> None:
     start, end = nested
-    deep = f"{start * depth}1{end * depth}"
-    for field in ("model", "parameters", "sweep", "unknown"):
-        body = f'{{"datasets": ["d"], {others} "{field}": {deep}}}'
+    for depth, field in product((60, 600, 960, 990), ("model", "parameters", "sweep", "unknown")):
+        body = f'{{"datasets": ["d"], {others} "{field}": {start * depth}1{end * depth}}}'
         answer = server.post(path, content=body, headers={"content-type": "application/json"})
         assert refused(answer, 422, "invalid")
 

@@ -24,13 +24,6 @@ FEW = {
     "parameters": {name: {"lower": 0.1, "upper": 0.5} for name in "abcd"},
     "equations": {"x": "a*u - b*x + c + d*x**2"},
 }
-POLYNOMIAL = {
-    "name": "narx",
-    "form": "polynomial",
-    "inputs": {"u": "V"},
-    "output": "y",
-    "coefficients": {"lower": -1, "upper": 1},
-}
 
 
 def with_changes(dataset: str, changes: dict[str, Any]) -> dict[str, Any]:
@@ -46,56 +39,36 @@ JOBS: list[tuple[dict[str, Any], str, str]] = [
     ({"channels": {"u": "volts"}}, "/channels/u", "no channel 'volts'"),
     ({"channels": {"w": "u"}}, "/channels/w", "no signal 'w'"),
     ({"algorithm": {"populaton": 50}}, "/algorithm/populaton", "did you mean 'population'?"),
-    ({"algoritm": {}}, "/algoritm", "did you mean 'algorithm'?"),
-    ({"algorithm": {"method": "best"}}, "/algorithm/method", "found 'best'"),
     ({"algorithm": {"population": 2}}, "/algorithm/population", "found 2"),
     ({"algorithm": {"population": 12, "islands": 4}}, "/algorithm/population", "4 islands"),
     ({"algorithm": {"mutation": [[5, 0.2]]}}, "/algorithm/mutation", "generation 0"),
     ({"parameters": {"LL": {"upper": 1}}}, "/parameters/LL", "no parameter 'LL'"),
     ({"parameters": {"L": {"lower": 4, "upper": 1}}}, "/parameters/L", "[4, 1]"),
     ({"parameters": {"L": {"lower": -1}}}, "/parameters", "-1 s"),
-    ({"parameters": {"L": {"uper": 1}}}, "/parameters/L/uper", "did you mean 'upper'?"),
-    ({"parameters": {"L": {"upper": 100}}}, "/datasets/0", "lasts 29.9 s"),
-    ({"loss": {"kind": "cubes"}}, "/loss/kind", "found 'cubes'"),
     ({"hold": {"y": "zero"}}, "/hold/y", "has no input 'y'"),
     ({"weights": {"z": 1}}, "/weights/z", "no output 'z'"),
     ({"weights": {"y": -1}}, "/weights/y", "found -1"),
     ({"skip": 300}, "/datasets/0", "300 samples"),
     ({"validation": {}}, "/validation", "either"),
-    ({"validation": {"fraction": 1.5}}, "/validation/fraction", "found 1.5"),
     ({"validation": {"datasets": ["ds_x"]}}, "/validation/datasets/0", "'ds_x'"),
-    ({"seed": -1}, "/seed", "found -1"),
-    ({"trends": {"x": "length_m"}}, "/trends", "unknown field"),
     ({"algorithm": {"stop": {"evaluations": 10**40}}}, "/algorithm/stop/evaluations", "10000000"),
-    ({"algorithm": {"stagnation": 10**30}}, "/algorithm/stagnation", "1000000000"),
     ({"algorithm": {"mutation": [[0, 0.2], [10**30, 0.8]]}}, "/algorithm/mutation/1/0", "found 1"),
-    ({"algorithm": {"migration": {"every": 10**30}}}, "/algorithm/migration/every", "found 1"),
     (
         {"validation": {"fraction": 0.9}, "parameters": {"L": {"upper": 5}}},
         "/datasets/0",
         "estimation part: the record lasts 2.9 s",
     ),
-    ({"validation": {"fraction": 0.9}, "skip": 30}, "/datasets/0", "30 samples"),
     ({"validation": {"fraction": 0.001}}, "/validation/fraction", "would be empty"),
-    ({"validation": {"fraction": 0.999}}, "/validation/fraction", "would be empty"),
-    (
-        {"parameters": {"L": {"fixed": 40, "upper": 5}}},
-        "/parameters/L/fixed",
-        "40 lies outside the bounds",
-    ),
-    ({"parameters": {"K": {"tied": "2*K"}}}, "/parameters/K/tied", "circular, K → K"),
     (
         {"parameters": {"K": {"tied": "T"}, "T": {"tied": "K"}}},
         "/parameters/K/tied",
         "circular, K → T → K",
     ),
-    ({"parameters": {"K": {"tied": "2*Q"}}}, "/parameters/K/tied", "'Q' is not declared"),
-    ({"parameters": {"K": {"tied": "2*"}}}, "/parameters/K/tied", "column 3"),
-    ({"parameters": {"K": {"tied": 2}}}, "/parameters/K/tied", "found 2"),
-    ({"parameters": {"L": {"tied": "T - 20"}}}, "/parameters", "as small as"),
-    ({"parameters": {"K": {"tied": "T", "lower": 0}}}, "/parameters/K", "leave out 'lower'"),
-    ({"skip": 297, "model": FEW}, "/datasets", "3 scored samples for 4 free parameters"),
-    ({"model": {**POLYNOMIAL, "terms": ["y(k-1)", "u(k-"]}}, "/model/terms/1", "expression ends"),
+    (
+        {"skip": 207, "validation": {"fraction": 0.3}, "model": FEW},
+        "/datasets",
+        "3 scored samples for 4 free parameters",
+    ),
     (
         {"parameters": {name: {"fixed": 1} for name in ("K", "T", "L", "y0", "x(0)")}},
         "/parameters",
@@ -123,26 +96,17 @@ AXES: list[tuple[dict[str, Any], str, str]] = [
     ({"path": "/seed", "range": [0, 900000]}, "axes", "900000 runs"),
     ({"path": "/noise/sigma", "log": [0, 1, 3]}, "log", "start > 0"),
     ({"path": "/seed", "log": [1, 10, 5]}, "log", "found 1.778"),
-    ({"path": "/noise/seed", "log": [1, 10, 3]}, "log", "found 3.16"),
     ({"path": "/seed", "values": [1, "3"]}, "values/1", "found '3'; write 3"),
     ({"path": "/algorithm/population", "values": [50.0]}, "values/0", "found 50.0; write 50"),
     ({"path": "/seed", "range": [-3, 5]}, "range", "found -3"),
-    ({"path": "/algorithm/population", "log": [16, 64, 4]}, "log", "found 25.3"),
-    ({"path": "/noise/sigma", "values": [0.1, "x"]}, "values/1", "found 'x'"),
     ({"path": "/algorithm/method", "values": ["simple", "bes"]}, "values/1", "found 'bes'"),
     ({"path": "/parameters/L/upper", "values": [1, -1]}, "values/1", "/parameters/L"),
     ({"path": "/seed", "values": [1, 2], "labels": [{"n": 1}]}, "labels", "1 labels for 2"),
-    (
-        {"path": "/seed", "values": [1, 2], "labels": [{"n": 1}, {'a"b': 1}]},
-        "labels/1",
-        "without quotation marks",
-    ),
     ({"path": "/seed", "values": [1], "labels": [{"a\\b": 1}]}, "labels/0", "backslashes"),
     ({"path": "/seed", "values": [1], "labels": [{"a\nb": 1}]}, "labels/0", "printable"),
     ({"path": "/seed", "values": [1], "labels": [{"a" * 65: 1}]}, "labels/0", "1 to 64"),
     ({"path": "/algorithm", "values": [{}, {"metod": 1}]}, "values/1", "did you mean 'method'?"),
     ({"path": "/datasets", "values": [["nope"]]}, "values/0", "no dataset 'nope'"),
-    ({"path": "/model", "values": ["fopdt", "sopd"]}, "values/1", "no model 'sopd'"),
 ]
 
 
@@ -156,18 +120,8 @@ def test_a_sweep_that_cannot_be_expanded_is_refused_at_its_axis(
     assert [fault for fault in faults if fault["pointer"] == pointer and words in fault["detail"]]
 
 
-def test_every_fault_of_a_job_is_told_at_once(server: TestClient, dataset: str) -> None:
-    body = {"model": "nope", "datasets": ["gone", dataset], "algorithm": {"bits": 24}}
-    faults = refused(server.post("/v1/jobs", json=body), 422, "invalid")
-    assert {fault["pointer"] for fault in faults} == {"/model", "/datasets/0"}
-
-
 MODELS: list[tuple[dict[str, Any], str, int | None, str]] = [
     ({"equations": {"x": "K*u(t - L) - z"}}, "/equations/x", 14, "'z'"),
-    ({"initial": {"x": "K*z0"}}, "/initial/x", 3, "'z0'"),
-    ({"initial": "steady", "equations": {"x": "K*u(t - L)"}}, "/initial/x", None, "integrator"),
-    ({"equations": {"x": "__import__('os')"}}, "/equations/x", 1, "__import__"),
-    ({"equations": {"x": "K*u(t + L) - x"}}, "/equations/x", 3, "L"),
     (
         {"parameters": {"K": {"lower": 5, "upper": 0}, "L": {"lower": 0, "upper": 2}}},
         "/parameters/K",
@@ -213,20 +167,16 @@ def test_an_own_model_cannot_take_the_name_of_a_built_in_one(server: TestClient)
     assert refused(answer, 422, "invalid")[0]["pointer"] == "/name"
 
 
-@pytest.mark.parametrize("name", ["a/b", "a@1", ".", "a?b", "a b"])
-def test_a_name_under_which_a_model_could_not_be_read_is_refused(
-    server: TestClient, name: str
-) -> None:
-    answer = server.post("/v1/models", json={**MODEL, "name": name})
-    assert refused(answer, 422, "invalid")[0]["pointer"] == "/name"
+def test_a_name_under_which_a_model_could_not_be_read_is_refused(server: TestClient) -> None:
+    for name in ("a/b", "a@1", ".", "a?b", "a b"):
+        answer = server.post("/v1/models", json={**MODEL, "name": name})
+        assert refused(answer, 422, "invalid")[0]["pointer"] == "/name"
 
 
-@pytest.mark.parametrize("name", ["a", "A.b_c-1", "9" * 64])
-def test_a_model_can_be_read_under_every_name_that_it_may_have(
-    server: TestClient, name: str
-) -> None:
-    assert server.post("/v1/models", json={**MODEL, "name": name}).status_code == 201
-    assert server.get(f"/v1/models/{name}").json()["name"] == name
+def test_a_model_can_be_read_under_every_name_that_it_may_have(server: TestClient) -> None:
+    for name in ("a", "A.b_c-1", "9" * 64):
+        assert server.post("/v1/models", json={**MODEL, "name": name}).status_code == 201
+        assert server.get(f"/v1/models/{name}").json()["name"] == name
 
 
 def test_pages_of_models_have_each_once_and_the_built_in_ones_first(own: TestClient) -> None:
@@ -243,20 +193,10 @@ def test_pages_of_models_have_each_once_and_the_built_in_ones_first(own: TestCli
     assert len(names) == len(set(names))
 
 
-UPLOADS: list[tuple[bytes, str]] = [
-    (b"t,u,y\n0,1,2\n0.1,volt,3\n", "row 3, column 'u'"),
-    (b"", "empty"),
-    (b"t,u,y\n0,1,2\n0.2,1,2\n0.1,1,2\n", "decreases"),
-]
-
-
-@pytest.mark.parametrize(("content", "words"), UPLOADS)
-def test_a_csv_that_cannot_be_read_is_refused_with_its_row(
-    server: TestClient, content: bytes, words: str
-) -> None:
-    answer = server.post("/v1/datasets", content=content, headers=CSV)
+def test_a_csv_that_cannot_be_read_is_refused_with_its_row(server: TestClient) -> None:
+    answer = server.post("/v1/datasets", content=b"t,u,y\n0,1,2\n0.1,volt,3\n", headers=CSV)
     refused(answer, 422, "invalid-upload")
-    assert words in answer.json()["detail"]
+    assert "row 3, column 'u'" in answer.json()["detail"]
 
 
 def test_a_damaged_mcap_is_refused(server: TestClient, dataset: str) -> None:
@@ -290,16 +230,7 @@ SIMULATIONS: list[tuple[dict[str, Any], str, str]] = [
     ({"model": "nope"}, "/model", "no model 'nope'"),
     ({"parameters": {"K": 1, "T": 1, "y0": 0}}, "/parameters/L", "true value"),
     ({"parameters": {"K": 1, "T": 1, "L": 0.5, "Z": 1}}, "/parameters/Z", "no parameter 'Z'"),
-    ({"inputs": {}}, "/inputs/u", "give input 'u'"),
     ({"inputs": {"u": {"kind": "cosine"}}}, "/inputs/u", "omega"),
-    ({"inputs": {"u": {"kind": "saw"}}}, "/inputs/u", "saw"),
-    (
-        {"inputs": {"u": {"kind": "expression", "expression": "cos(w*t)"}}},
-        "/inputs/u/expression",
-        "'w'",
-    ),
-    ({"samples": 1}, "/samples", "found 1"),
-    ({"sample_time": 0}, "/sample_time", "found 0"),
 ]
 
 
@@ -319,19 +250,12 @@ def test_a_simulation_that_cannot_be_done_is_refused(
     assert [fault for fault in faults if fault["pointer"] == pointer and words in fault["detail"]]
 
 
-@pytest.mark.parametrize(
-    ("steps", "pointer"),
-    [
-        ([{"smooth": {}}], "/steps/0/smooth"),
-        ([{"trim": {"start": 5, "stop": 2}}], "/steps/0/trim/stop"),
-        ([{"detrend": {}}, {"noise": {"sigma": -1, "channels": ["y"]}}], "/steps/1/noise/sigma"),
-    ],
-)
 def test_a_derivation_that_cannot_be_done_is_refused_at_its_step(
-    server: TestClient, dataset: str, steps: list[Any], pointer: str
+    server: TestClient, dataset: str
 ) -> None:
+    steps = [{"detrend": {}}, {"noise": {"sigma": -1, "channels": ["y"]}}]
     answer = server.post(f"/v1/datasets/{dataset}:derive", json={"steps": steps})
-    assert refused(answer, 422, "invalid")[0]["pointer"] == pointer
+    assert refused(answer, 422, "invalid")[0]["pointer"] == "/steps/1/noise/sigma"
 
 
 def test_a_body_that_is_not_json_is_refused(server: TestClient) -> None:
@@ -364,13 +288,6 @@ def test_a_body_that_no_json_reader_takes_is_refused_with_the_reason(
 ) -> None:
     answer = server.post("/v1/jobs", content=text, headers={"content-type": "application/json"})
     assert words in refused(answer, 422, "invalid")[0]["detail"]
-
-
-def test_a_body_that_is_not_said_to_be_json_is_of_another_kind(server: TestClient) -> None:
-    for kind in ("text/plain", "application/x-www-form-urlencoded"):
-        answer = server.post("/v1/jobs", content=b"{}", headers={"content-type": kind})
-        refused(answer, 415, "unsupported-media-type")
-        assert kind in answer.json()["detail"]
 
 
 def test_a_recording_is_not_taken_twice(server: TestClient, dataset: str) -> None:
@@ -413,9 +330,7 @@ def test_a_population_that_no_memory_holds_is_refused(server: TestClient, datase
 @pytest.mark.parametrize(
     ("query", "pointer"),
     [
-        ("limit=0", "?limit"),
         ("limit=x", "?limit"),
-        ("state=done", "?state"),
         ("limit=1001", "?limit"),
         ("state=queued&state=foo", "?state"),
     ],
@@ -425,19 +340,6 @@ def test_a_query_value_that_cannot_be_used_is_named(
 ) -> None:
     faults = refused(server.get(f"/v1/jobs?{query}"), 422, "invalid")
     assert faults[0]["pointer"] == pointer
-
-
-def test_a_fault_of_a_batch_is_told_at_its_entry_also_where_entries_are_not_in_order(
-    server: TestClient, dataset: str
-) -> None:
-    names = [["gone"], [dataset], ["lost"]]
-    batch = [{"x": x, "datasets": name} for x, name in zip((8, 2, 4), names, strict=True)]
-    body = {"model": "fopdt", "label": "n", "trend_parameters": ["L"], "batch": batch}
-    faults = refused(server.post("/v1/recipes/reidentify", json=body), 422, "invalid")
-    assert {(one["pointer"], one["detail"].split("'")[1]) for one in faults} == {
-        ("/batch/0/datasets/0", "gone"),
-        ("/batch/2/datasets/0", "lost"),
-    }
 
 
 def test_a_text_that_no_database_can_keep_is_refused(server: TestClient, dataset: str) -> None:

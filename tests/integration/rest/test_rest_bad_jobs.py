@@ -97,17 +97,6 @@ def test_a_constant_output_is_fitted_and_the_fit_is_said_to_be_none(
     assert any("worse than a straight line" in one for one in run["warnings"])
 
 
-@pytest.mark.parametrize("fields", [{"skip": 298}, {"skip": 208, "validation": {"fraction": 0.3}}])
-def test_fewer_scored_samples_than_parameters_are_refused(
-    parts: tuple[TestClient, Parts], fields: dict[str, Any]
-) -> None:
-    client, _ = parts
-    body = {"model": FIRST, "datasets": [store_csv(client, recording())], **fields}
-    (fault,) = refused(client.post("/v1/jobs", json=body), 422, "invalid")
-    assert fault["pointer"] == "/datasets"
-    assert "2 scored samples for 3 free parameters" in fault["detail"]
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -116,7 +105,6 @@ def test_fewer_scored_samples_than_parameters_are_refused(
             "9 lies outside the bounds [0, 5] of 'L'",
         ),
         (["--set", "parameters.K.tied=T", "--set", "parameters.T.tied=K"], "circular, K → T → K"),
-        (["--set", "weights.z=1"], "no output 'z'"),
     ],
 )
 def test_the_command_line_says_the_same_in_one_line(

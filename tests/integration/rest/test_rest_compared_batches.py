@@ -1,6 +1,5 @@
 """What a batch is compared with, and what it is not to be: of another model, otherwise made."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import httpx
@@ -11,18 +10,18 @@ from service.cli import common
 from service.cli.main import build_program
 from service.client.client import Client
 from service.trends import trend as trends
-from tests.batches import BODY, LENGTHS, ServedBatch, identify_batch, serve_batch
+from tests.batches import BODY, LENGTHS, ServedBatch, identify_batch
 from tests.integration.rest.test_rest_reidentify import quantity, run_at, trend
 from tests.rest import refused
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedBatch]:
+def served(served_batch: ServedBatch) -> ServedBatch:
     """The batch, whose run at 8 m is a reference."""
-    with serve_batch(tmp_path_factory.mktemp("compared")) as found:
-        told = found.server.put("/v1/references/tube", json={"run": run_at(found, found.job, 8.0)})
-        assert told.status_code == 200, told.text
-        yield found
+    reference = {"run": run_at(served_batch, served_batch.job, 8.0)}
+    told = served_batch.server.put("/v1/references/tube", json=reference)
+    assert told.status_code == 200, told.text
+    return served_batch
 
 
 def against(served: ServedBatch, **fields: Any) -> dict[str, Any]:

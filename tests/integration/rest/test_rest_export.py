@@ -4,7 +4,6 @@ import csv
 import io
 import json
 import re
-from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +14,6 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.api.app import create_app
 from service.cli import common
 from service.cli.main import build_program
 from service.client.async_client import AsyncClient
@@ -24,7 +22,7 @@ from service.client.client import Client
 from tests.exporting import in_control, in_python
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
-from tests.rest import awaited, parts_of, recording, refused, settings_of, store_csv
+from tests.rest import awaited, parts_of, recording, refused, store_csv
 
 SMALL = {"population": 16, "generations": 20, "islands": 1}
 POLYNOMIAL = {
@@ -56,23 +54,21 @@ class Served(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    app = create_app(settings_of(tmp_path_factory.mktemp("exports")))
-    with TestClient(app) as server:
-        data = store_csv(server, recording(columns=("u [V]", "y [degC]")))
-        parts = parts_of(server)
-        body = {
-            "model": "fopdt",
-            "datasets": [data],
-            "algorithm": SMALL,
-            "hold": {"u": "zero"},
-            "parameters": {"K": {"lower": 0, "upper": 5}, "L": {"upper": 2}, "x(0)": {"fixed": 0}},
-        }
-        _, (run,) = identified(parts, body)
-        _, (polynomial,) = identified(parts, {**body, "model": POLYNOMIAL, "parameters": {}})
-        waiting = server.post("/v1/jobs", json=body).json()["id"]
-        (queued,) = server.get(f"/v1/jobs/{waiting}/runs").json()["items"]
-        yield Served(server, data, run, polynomial, queued["id"])
+def served(server: TestClient) -> Served:
+    data = store_csv(server, recording(columns=("u [V]", "y [degC]")))
+    parts = parts_of(server)
+    body = {
+        "model": "fopdt",
+        "datasets": [data],
+        "algorithm": SMALL,
+        "hold": {"u": "zero"},
+        "parameters": {"K": {"lower": 0, "upper": 5}, "L": {"upper": 2}, "x(0)": {"fixed": 0}},
+    }
+    _, (run,) = identified(parts, body)
+    _, (polynomial,) = identified(parts, {**body, "model": POLYNOMIAL, "parameters": {}})
+    waiting = server.post("/v1/jobs", json=body).json()["id"]
+    (queued,) = server.get(f"/v1/jobs/{waiting}/runs").json()["items"]
+    return Served(server, data, run, polynomial, queued["id"])
 
 
 def export(served: Served, run: str, **given: Any) -> httpx.Response:

@@ -1,16 +1,14 @@
 """The noise model that is chosen where none is asked for, over REST."""
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from service.api.app import create_app
 from service.api.dependencies import Parts
 from tests.identified import identified
-from tests.rest import parts_of, refused, settings_of, store_csv
+from tests.rest import parts_of, refused, store_csv
 from tests.unit.sysid.noise_models.test_noise_model_choice import (
     LAG,
     STEP,
@@ -40,21 +38,19 @@ class Served(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    app = create_app(settings_of(tmp_path_factory.mktemp("noise")))
-    with TestClient(app) as server:
-        parts = parts_of(server)
-        names = []
-        quiet = plant(0.0, np.zeros(N)) + 0.05 * coloured(N, 0.0, 7)
-        outputs = {"tank": disturbed(2), "lag": delayed(2), "quiet": quiet}
-        for name, output in outputs.items():
-            pairs = zip(signal(), output, strict=True)
-            lines = [
-                "t,u,y",
-                *(f"{k * STEP:.6g},{u},{float(y)!r}" for k, (u, y) in enumerate(pairs)),
-            ]
-            names.append(store_csv(server, "\n".join(lines).encode(), name))
-        yield Served(server, parts, *names)
+def served(server: TestClient) -> Served:
+    parts = parts_of(server)
+    names = []
+    quiet = plant(0.0, np.zeros(N)) + 0.05 * coloured(N, 0.0, 7)
+    outputs = {"tank": disturbed(2), "lag": delayed(2), "quiet": quiet}
+    for name, output in outputs.items():
+        pairs = zip(signal(), output, strict=True)
+        lines = [
+            "t,u,y",
+            *(f"{k * STEP:.6g},{u},{float(y)!r}" for k, (u, y) in enumerate(pairs)),
+        ]
+        names.append(store_csv(server, "\n".join(lines).encode(), name))
+    return Served(server, parts, *names)
 
 
 def run(served: Served, model: dict[str, Any], dataset: str, **more: Any) -> dict[str, Any]:

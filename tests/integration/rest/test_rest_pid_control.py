@@ -1,7 +1,6 @@
 """PI and PID control, tuning rules and margins in `:simulate`, over REST and the command line."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,12 +9,11 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.api.app import create_app
 from service.cli import common, runs
 from service.client.client import Client
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
-from tests.rest import refused, settings_of
+from tests.rest import parts_of, refused
 
 STEP = {"kind": "step", "amplitude": 1.0}
 CONTROL = {"input": "u", "output": "y", "gain": 0.5, "integral_time": 1.0, "reference": STEP}
@@ -42,30 +40,28 @@ class Served(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    app = create_app(settings_of(tmp_path_factory.mktemp("controlled")))
-    with TestClient(app) as server:
-        found = []
-        for model, values in (("fopdt", {**PLANT}), (ARX, {"a": 0.9, "b": 0.1})):
-            made = server.post(
-                "/v1/datasets:simulate",
-                json={
-                    "model": model,
-                    "parameters": values,
-                    "samples": 200,
-                    "sample_time": 0.1,
-                    "inputs": {"u": {"kind": "binary", "period": 2}},
-                },
-            )
-            assert made.status_code == 201, made.text
-            body = {
+def served(server: TestClient) -> Served:
+    found = []
+    for model, values in (("fopdt", {**PLANT}), (ARX, {"a": 0.9, "b": 0.1})):
+        made = server.post(
+            "/v1/datasets:simulate",
+            json={
                 "model": model,
-                "datasets": [made.json()["id"]],
-                "algorithm": {"population": 16, "generations": 25, "islands": 1},
-            }
-            _, [run] = identified(app.state.parts, body)
-            found.append(run)
-        yield Served(server, *found)
+                "parameters": values,
+                "samples": 200,
+                "sample_time": 0.1,
+                "inputs": {"u": {"kind": "binary", "period": 2}},
+            },
+        )
+        assert made.status_code == 201, made.text
+        body = {
+            "model": model,
+            "datasets": [made.json()["id"]],
+            "algorithm": {"population": 16, "generations": 25, "islands": 1},
+        }
+        _, [run] = identified(parts_of(server), body)
+        found.append(run)
+    return Served(server, *found)
 
 
 def simulated(served: Served, run: str | None = None, **control: Any) -> dict[str, Any]:
@@ -192,13 +188,7 @@ def test_of_a_loop_that_is_hardly_stable_it_is_said_that_its_swing_decays(served
 @pytest.mark.parametrize(
     ("change", "pointer", "part"),
     [
-        ({"integral_time": -1.0}, "/control/integral_time", "above 0"),
         ({"integral_time": 0.0}, "/control/integral_time", "above 0"),
-        ({"derivative_time": -0.1}, "/control/derivative_time", "0"),
-        ({"derivative_filter": 0}, "/control/derivative_filter", "above 0"),
-        ({"derivative_on": "output"}, "/control/derivative_on", "measurement"),
-        ({"anti_windup": "clamping"}, "/control/anti_windup", "back-calculation"),
-        ({"tracking_time": 0}, "/control/tracking_time", "above 0"),
         ({"lower": 1.0, "upper": -1.0}, "/control/upper", "found -1, and 1 as lower limit"),
         ({"limit": 1.0, "lower": 0.0}, "/control/lower", "the limit ± is given too"),
         ({"gain": None}, "/control/gain", "is missing. Give it, or give a tuning rule as 'tuning'"),
@@ -210,12 +200,6 @@ def test_of_a_loop_that_is_hardly_stable_it_is_said_that_its_swing_decays(served
             "the tuning rule chooses this value",
         ),
         ({"tuning": {"rule": "ziegler"}}, "/control/tuning/rule", "simc"),
-        ({"tuning": {"controller": "PD"}}, "/control/tuning/controller", "PID"),
-        (
-            {"tuning": {"closed_loop_time_constant": 0}},
-            "/control/tuning/closed_loop_time_constant",
-            "above 0",
-        ),
         (
             {
                 "tuning": {"rule": "amigo", "closed_loop_time_constant": 1},

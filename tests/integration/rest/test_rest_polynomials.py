@@ -31,9 +31,7 @@ def test_a_job_may_ask_for_a_selection(server: TestClient, dataset: str) -> None
     ("terms", "place", "part"),
     [
         (frols(0), "/model/terms/keep", "whole number from 1 to 14"),
-        (frols(15), "/model/terms/keep", "14 candidate terms"),
         ({"select": "fro"}, "/model/terms/select", "frols"),
-        ({"select": "frols"}, "/model/terms/keep", "is missing"),
         (frols(3, error="both"), "/model/terms/error", "one-step"),
         (frols(3, exchange=1), "/model/terms/exchange", "true or false"),
         (frols(1, candidates=["y(k-1"]), "/model/terms/candidates/0", ""),

@@ -1,20 +1,18 @@
 """Ties, groups, criteria and profiles of a run that was identified, over REST."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
-from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
 import service.runs.profiles
-from service.api.app import create_app
 from service.cli import common
 from service.cli.runs import app as runs_app
 from service.client.client import Client
-from tests.identified import identified
+from tests.identified import ServedRun, serve_run
 from tests.integration.rest.test_client import Through
-from tests.rest import parts_of, recording, refused, settings_of, store_csv
+from tests.rest import refused
 
 SMALL = {"population": 20, "generations": 60, "islands": 1}
 MODEL: dict[str, Any] = {
@@ -30,37 +28,26 @@ MODEL: dict[str, Any] = {
 }
 
 
-class Served(NamedTuple):
-    server: TestClient
-    run: str
-
-
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    app = create_app(settings_of(tmp_path_factory.mktemp("profiles")))
-    with TestClient(app) as server:
-        data = store_csv(server, recording())
-        body = {
-            "model": MODEL,
-            "datasets": [data],
-            "algorithm": SMALL,
-            "noise": {"sigma": 0.02},
-            "parameters": {"r": {"fixed": 1}, "T": {"tied": "r"}},
-            "hold": {"u": "zero"},
-            "validation": {"fraction": 0.2},
-        }
-        parts = parts_of(server)
-        _, runs = identified(parts, body)
-        yield Served(server, runs[0])
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedRun]:
+    changes = {
+        "model": MODEL,
+        "algorithm": SMALL,
+        "noise": {"sigma": 0.02},
+        "parameters": {"r": {"fixed": 1}, "T": {"tied": "r"}},
+        "validation": {"fraction": 0.2},
+    }
+    with serve_run(tmp_path_factory.mktemp("profiles"), **changes) as run:
+        yield run
 
 
-def result(served: Served) -> dict[str, Any]:
+def result(served: ServedRun) -> dict[str, Any]:
     document: dict[str, Any] = served.server.get(f"/v1/runs/{served.run}").json()
     assert document["state"] == "succeeded", document["error"]
     return document
 
 
-def test_groups_ties_and_criteria_are_in_the_result(served: Served) -> None:
+def test_groups_ties_and_criteria_are_in_the_result(served: ServedRun) -> None:
     document = result(served)
     (group,) = document["identifiability"]["groups"]
     assert group["expression"] == "k*A/J"
@@ -80,7 +67,7 @@ def test_groups_ties_and_criteria_are_in_the_result(served: Served) -> None:
     assert document["criteria"]["parameters"] == 4
 
 
-def test_the_minima_and_whether_the_search_settled_are_in_the_result(served: Served) -> None:
+def test_the_minima_and_whether_the_search_settled_are_in_the_result(served: ServedRun) -> None:
     document = served.server.get(f"/v1/runs/{served.run}").json()
     search = document["search"]
     assert search["settled"] is (search["because"] is not None)
@@ -96,7 +83,7 @@ def test_the_minima_and_whether_the_search_settled_are_in_the_result(served: Ser
     assert history["names"] == ["k", "A", "J", "L"]
 
 
-def test_a_profile_has_the_interval_and_its_figure(served: Served) -> None:
+def test_a_profile_has_the_interval_and_its_figure(served: ServedRun) -> None:
     body = {"parameters": ["L"], "points": 9}
     answer = served.server.post(f"/v1/runs/{served.run}:profile", json=body).json()
     (one,) = answer["profiles"]
@@ -115,14 +102,14 @@ def test_a_profile_has_the_interval_and_its_figure(served: Served) -> None:
     assert trace["y"] == one["ratio"]
 
 
-def test_a_member_of_a_group_has_an_open_profile(served: Served) -> None:
+def test_a_member_of_a_group_has_an_open_profile(served: ServedRun) -> None:
     body = {"parameters": ["J"], "points": 5}
     answer = served.server.post(f"/v1/runs/{served.run}:profile", json=body).json()
     assert answer["profiles"][0]["interval95"] == [None, None]
 
 
 def test_a_profile_that_cannot_be_had_is_refused(
-    served: Served, monkeypatch: pytest.MonkeyPatch
+    served: ServedRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url = f"/v1/runs/{served.run}:profile"
     fault = refused(served.server.post(url, json={"parameters": ["LL"]}), 422, "invalid")[0]
@@ -139,7 +126,7 @@ def test_a_profile_that_cannot_be_had_is_refused(
     assert "need at most 10" in fault["detail"]
 
 
-def test_the_command_tells_intervals(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_tells_intervals(served: ServedRun, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         common,
         "connect_client",

@@ -1,7 +1,6 @@
 """Batch re-identification over REST: trend, drift from a reference, acceptance, bad input."""
 
 import json
-from collections.abc import Iterator
 from typing import Any
 from urllib.parse import quote
 
@@ -18,7 +17,6 @@ from tests.batches import (
     ServedBatch,
     identify_batch,
     make_recording,
-    serve_batch,
     store_tube,
 )
 from tests.identified import carried_out
@@ -26,14 +24,8 @@ from tests.integration.rest.test_client import Through
 from tests.rest import refused
 
 
-@pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedBatch]:
-    with serve_batch(tmp_path_factory.mktemp("batch")) as found:
-        yield found
-
-
-def trend(served: ServedBatch, job: str) -> dict[str, Any]:
-    answer = served.server.get(f"/v1/jobs/{job}/trend")
+def trend(served_batch: ServedBatch, job: str) -> dict[str, Any]:
+    answer = served_batch.server.get(f"/v1/jobs/{job}/trend")
     assert answer.status_code == 200, answer.text
     return dict(answer.json())
 
@@ -46,13 +38,15 @@ def chosen(one: dict[str, Any]) -> dict[str, Any]:
     return next(dict(law) for law in one["laws"] if law["is_chosen"])
 
 
-def run_at(served: ServedBatch, job: str, x: float) -> str:
-    place = next(one for one in trend(served, job)["labels"] if one["x"] == x)
+def run_at(served_batch: ServedBatch, job: str, x: float) -> str:
+    place = next(one for one in trend(served_batch, job)["labels"] if one["x"] == x)
     return str(place["runs"][0])
 
 
-def test_a_batch_gives_each_length_in_order_with_errors_onset_and_span(served: ServedBatch) -> None:
-    found = trend(served, served.job)
+def test_a_batch_gives_each_length_in_order_with_errors_onset_and_span(
+    served_batch: ServedBatch,
+) -> None:
+    found = trend(served_batch, served_batch.job)
     assert [one["x"] for one in found["labels"]] == list(LENGTHS)
     assert [one["name"] for one in found["quantities"]] == ["L", "T", "onset delay"]
     for point in quantity(found, "L")["points"]:
@@ -68,15 +62,15 @@ def test_a_batch_gives_each_length_in_order_with_errors_onset_and_span(served: S
     assert found["missing"] == 0
 
 
-def test_runs_begin_at_their_neighbours(served: ServedBatch) -> None:
-    request = served.server.get(f"/v1/jobs/{served.job}").json()["request"]
+def test_runs_begin_at_their_neighbours(served_batch: ServedBatch) -> None:
+    request = served_batch.server.get(f"/v1/jobs/{served_batch.job}").json()["request"]
     assert request["warm_start"] == "previous"
     labels = request["sweep"]["axes"][0]["labels"]
     assert [one["length_m"] for one in labels] == list(LENGTHS)
 
 
-def test_the_laws_are_those_of_the_tube_and_predictions_hold(served: ServedBatch) -> None:
-    found = trend(served, served.job)
+def test_the_laws_are_those_of_the_tube_and_predictions_hold(served_batch: ServedBatch) -> None:
+    found = trend(served_batch, served_batch.job)
     delay, constant = quantity(found, "L"), quantity(found, "T")
     assert chosen(delay)["law"] == "line"
     slope = chosen(delay)["coefficients"][1]
@@ -90,12 +84,12 @@ def test_the_laws_are_those_of_the_tube_and_predictions_hold(served: ServedBatch
     assert all(place["lower"] <= place["value"] <= place["upper"] for place in delay["band"])
 
 
-def test_experiments_of_one_length_are_fitted_together_or_pooled(served: ServedBatch) -> None:
-    both = [{"x": x, "datasets": served.datasets[x]} for x in LENGTHS]
-    jointly = trend(served, identify_batch(served.server, batch=both))
+def test_experiments_of_one_length_are_fitted_together_or_pooled(served_batch: ServedBatch) -> None:
+    both = [{"x": x, "datasets": served_batch.datasets[x]} for x in LENGTHS]
+    jointly = trend(served_batch, identify_batch(served_batch.server, batch=both))
     assert quantity(jointly, "L")["between_runs"] is None
-    apart = [{"x": x, "datasets": [one]} for x in LENGTHS for one in served.datasets[x]]
-    pooled = trend(served, identify_batch(served.server, batch=apart))
+    apart = [{"x": x, "datasets": [one]} for x in LENGTHS for one in served_batch.datasets[x]]
+    pooled = trend(served_batch, identify_batch(served_batch.server, batch=apart))
     assert quantity(pooled, "L")["between_runs"] > 0
     for one, two in zip(
         quantity(jointly, "L")["points"], quantity(pooled, "L")["points"], strict=True
@@ -104,18 +98,20 @@ def test_experiments_of_one_length_are_fitted_together_or_pooled(served: ServedB
         assert one["value"] == pytest.approx(two["value"], abs=4 * two["stderr"])
 
 
-def test_an_unchanged_batch_does_not_drift_and_a_changed_length_does(served: ServedBatch) -> None:
-    reference = run_at(served, served.job, 8.0)
-    accepted = served.server.put("/v1/references/tube", json={"run": reference, "by": "me"})
+def test_an_unchanged_batch_does_not_drift_and_a_changed_length_does(
+    served_batch: ServedBatch,
+) -> None:
+    reference = run_at(served_batch, served_batch.job, 8.0)
+    accepted = served_batch.server.put("/v1/references/tube", json={"run": reference, "by": "me"})
     assert accepted.status_code == 200, accepted.text
-    changed = store_tube(served.server, 8.0, 3, longer=0.05)
-    batch = [{"x": x, "datasets": served.datasets[x][1:]} for x in LENGTHS if x != 8.0]
+    changed = store_tube(served_batch.server, 8.0, 3, longer=0.05)
+    batch = [{"x": x, "datasets": served_batch.datasets[x][1:]} for x in LENGTHS if x != 8.0]
     job = identify_batch(
-        served.server,
+        served_batch.server,
         reference="tube",
         batch=[*batch, {"x": 8.0, "datasets": [changed]}],
     )
-    found = trend(served, job)
+    found = trend(served_batch, job)
     assert (found["reference"], found["reference_x"]) == (reference, 8.0)
     drifted = {
         (point["x"], drift["kind"])
@@ -131,35 +127,37 @@ def test_an_unchanged_batch_does_not_drift_and_a_changed_length_does(served: Ser
         if one["kind"] == "run"
     )
     assert against_run["difference"] == pytest.approx(0.05, abs=0.005)
-    request = served.server.get(f"/v1/jobs/{job}").json()["request"]
+    request = served_batch.server.get(f"/v1/jobs/{job}").json()["request"]
     assert request["warm_start"] == request["trend"]["reference"] == reference
 
 
-def test_references_keep_their_history_and_say_what_is_wrong(served: ServedBatch) -> None:
-    first, second = (run_at(served, served.job, x) for x in (2.0, 4.0))
+def test_references_keep_their_history_and_say_what_is_wrong(served_batch: ServedBatch) -> None:
+    first, second = (run_at(served_batch, served_batch.job, x) for x in (2.0, 4.0))
     for run in (first, second, second):
-        answer = served.server.put("/v1/references/kept", json={"run": run})
+        answer = served_batch.server.put("/v1/references/kept", json={"run": run})
         assert answer.status_code == 200
-    told = served.server.get("/v1/references/kept").json()
+    told = served_batch.server.get("/v1/references/kept").json()
     assert (told["run"], [one["run"] for one in told["history"]]) == (second, [first])
     assert told["labels"] == {"length_m": 4.0}
     assert set(told["estimates"]) == {"K", "T", "L"}
-    assert "kept" in [one["name"] for one in served.server.get("/v1/references").json()["items"]]
-    wrong = served.server.put("/v1/references/kept", json={"run": "run_none"})
+    assert "kept" in [
+        one["name"] for one in served_batch.server.get("/v1/references").json()["items"]
+    ]
+    wrong = served_batch.server.put("/v1/references/kept", json={"run": "run_none"})
     assert refused(wrong, 422, "invalid")[0]["pointer"] == "/run"
-    missing = served.server.get("/v1/references/kep")
+    missing = served_batch.server.get("/v1/references/kep")
     assert missing.status_code == 404
     assert "did you mean 'kept'" in missing.json()["detail"]
 
 
-def test_every_unknown_dataset_of_a_batch_is_told_at_its_entry(served: ServedBatch) -> None:
+def test_every_unknown_dataset_of_a_batch_is_told_at_its_entry(served_batch: ServedBatch) -> None:
     batch = [
         {"x": 3, "datasets": ["ds_c"]},
         {"x": 1, "datasets": ["ds_a"]},
-        {"x": 2, "datasets": served.datasets[2.0][:1]},
+        {"x": 2, "datasets": served_batch.datasets[2.0][:1]},
         {"x": 4, "datasets": ["ds_d"]},
     ]
-    answer = served.server.post("/v1/recipes/reidentify", json={**BODY, "batch": batch})
+    answer = served_batch.server.post("/v1/recipes/reidentify", json={**BODY, "batch": batch})
     faults = refused(answer, 422, "invalid")
     assert {
         (one["pointer"][:17], named)
@@ -175,41 +173,41 @@ def test_every_unknown_dataset_of_a_batch_is_told_at_its_entry(served: ServedBat
 
 
 def test_a_warm_start_that_was_asked_for_is_told_also_for_a_batch_of_one(
-    served: ServedBatch,
+    served_batch: ServedBatch,
 ) -> None:
-    batch = [{"x": 2.0, "datasets": served.datasets[2.0][:1]}]
-    job = identify_batch(served.server, batch=batch, warm_start="previous")
-    told = served.server.get(f"/v1/jobs/{job}").json()
+    batch = [{"x": 2.0, "datasets": served_batch.datasets[2.0][:1]}]
+    job = identify_batch(served_batch.server, batch=batch, warm_start="previous")
+    told = served_batch.server.get(f"/v1/jobs/{job}").json()
     assert (told["state"], told["request"]["warm_start"]) == ("succeeded", "previous")
 
 
 @pytest.mark.parametrize("name", ["run_mine", "reference:x", "a/b", "..", " blank", "n" * 101])
 def test_a_name_that_means_something_else_is_refused_at_the_path(
-    served: ServedBatch, name: str
+    served_batch: ServedBatch, name: str
 ) -> None:
-    run = run_at(served, served.job, 2.0)
+    run = run_at(served_batch, served_batch.job, 2.0)
     path = f"/v1/references/{quote(name, safe='')}".replace("..", "%2E%2E")
-    (fault,) = refused(served.server.put(path, json={"run": run}), 422, "invalid")
+    (fault,) = refused(served_batch.server.put(path, json={"run": run}), 422, "invalid")
     assert fault["pointer"] == "{name}"
     assert "the name in the path is" in fault["detail"]
     assert "need" in fault["detail"]
 
 
-def test_references_are_paged_and_a_new_note_is_kept(served: ServedBatch) -> None:
-    run = run_at(served, served.job, 2.0)
+def test_references_are_paged_and_a_new_note_is_kept(served_batch: ServedBatch) -> None:
+    run = run_at(served_batch, served_batch.job, 2.0)
     for name in ("p1", "p2", "p3"):
         for note in ("first", "second"):
             body = {"run": run, "note": note}
-            assert served.server.put(f"/v1/references/{name}", json=body).status_code == 200
-    pages = served.server.get("/v1/references?limit=1&cursor=p1").json()
+            assert served_batch.server.put(f"/v1/references/{name}", json=body).status_code == 200
+    pages = served_batch.server.get("/v1/references?limit=1&cursor=p1").json()
     assert ([one["name"] for one in pages["items"]], pages["next"]) == (["p2"], "p2")
     assert pages["items"][0]["note"] == "second"
     assert set(pages["items"][0]["estimates"]) == {"K", "T", "L"}
-    told = served.server.get("/v1/references/p3").json()
+    told = served_batch.server.get("/v1/references/p3").json()
     assert [one["note"] for one in told["history"]] == ["first"]
-    client = Client("http://testserver", transport=Through(served.server))
+    client = Client("http://testserver", transport=Through(served_batch.server))
     assert {"p1", "p2", "p3"} <= {one["name"] for one in client.references()}
-    refused(served.server.get("/v1/references?limit=0"), 422, "invalid")
+    refused(served_batch.server.get("/v1/references?limit=0"), 422, "invalid")
 
 
 @pytest.mark.parametrize(
@@ -226,10 +224,12 @@ def test_references_are_paged_and_a_new_note_is_kept(served: ServedBatch) -> Non
     ],
 )
 def test_a_fault_is_told_at_its_place_in_the_recipe(
-    served: ServedBatch, fields: dict[str, Any], pointer: str, said: str
+    served_batch: ServedBatch, fields: dict[str, Any], pointer: str, said: str
 ) -> None:
-    batch = [{"x": x, "datasets": served.datasets[x]} for x in LENGTHS]
-    answer = served.server.post("/v1/recipes/reidentify", json={**BODY, "batch": batch, **fields})
+    batch = [{"x": x, "datasets": served_batch.datasets[x]} for x in LENGTHS]
+    answer = served_batch.server.post(
+        "/v1/recipes/reidentify", json={**BODY, "batch": batch, **fields}
+    )
     faults = refused(answer, 422, "invalid")
     assert pointer in faults[0]["pointer"]
     assert said in json.dumps(faults)
@@ -246,9 +246,9 @@ def test_a_fault_is_told_at_its_place_in_the_recipe(
     ],
 )
 def test_labels_missing_for_a_trend_are_told(
-    served: ServedBatch, labels: Any, pointer: str, said: str
+    served_batch: ServedBatch, labels: Any, pointer: str, said: str
 ) -> None:
-    values = [served.datasets[2.0][:1], served.datasets[4.0][:1]]
+    values = [served_batch.datasets[2.0][:1], served_batch.datasets[4.0][:1]]
     axis = {"path": "/datasets", "values": values, "labels": labels}
     body = {
         "model": "tube",
@@ -256,61 +256,69 @@ def test_labels_missing_for_a_trend_are_told(
         "sweep": {"axes": [axis]},
         "trend": {"x": "length_m"},
     }
-    (fault,) = refused(served.server.post("/v1/jobs", json=body), 422, "invalid")
+    (fault,) = refused(served_batch.server.post("/v1/jobs", json=body), 422, "invalid")
     assert fault["pointer"] == pointer
     assert said in fault["detail"]
 
 
-def test_a_trend_of_too_few_lengths_says_how_many_it_needs(served: ServedBatch) -> None:
-    batch = [{"x": x, "datasets": served.datasets[x][:1]} for x in LENGTHS[:2]]
-    found = trend(served, identify_batch(served.server, batch=batch))
+def test_a_trend_of_too_few_lengths_says_how_many_it_needs(served_batch: ServedBatch) -> None:
+    batch = [{"x": x, "datasets": served_batch.datasets[x][:1]} for x in LENGTHS[:2]]
+    found = trend(served_batch, identify_batch(served_batch.server, batch=batch))
     assert quantity(found, "L")["laws"] == []
     assert "needs 3" in quantity(found, "L")["reason"]
 
 
-def test_lengths_that_no_law_can_hold_are_told_and_the_page_is_shown(served: ServedBatch) -> None:
+def test_lengths_that_no_law_can_hold_are_told_and_the_page_is_shown(
+    served_batch: ServedBatch,
+) -> None:
     sizes = (-1e99, 1.0, 2.0, 1e99)
-    recordings = [served.datasets[x][:1] for x in LENGTHS]
+    recordings = [served_batch.datasets[x][:1] for x in LENGTHS]
     batch = [{"x": x, "datasets": one} for x, one in zip(sizes, recordings, strict=True)]
-    job = identify_batch(served.server, batch=batch)
-    assert [one["x"] for one in trend(served, job)["labels"]] == list(sizes)
-    assert served.server.get(f"/jobs/{job}").status_code == 200
+    job = identify_batch(served_batch.server, batch=batch)
+    assert [one["x"] for one in trend(served_batch, job)["labels"]] == list(sizes)
+    assert served_batch.server.get(f"/jobs/{job}").status_code == 200
 
 
-def test_a_job_without_a_trend_says_so(served: ServedBatch) -> None:
-    body = {"model": "tube", "datasets": served.datasets[2.0]}
-    job = served.server.post("/v1/jobs", json=body).json()["id"]
-    refused(served.server.get(f"/v1/jobs/{job}/trend"), 409, "conflict")
-    figure = served.server.get(f"/v1/jobs/{job}/figures/trend").json()
+def test_a_job_without_a_trend_says_so(served_batch: ServedBatch) -> None:
+    body = {"model": "tube", "datasets": served_batch.datasets[2.0]}
+    job = served_batch.server.post("/v1/jobs", json=body).json()["id"]
+    refused(served_batch.server.get(f"/v1/jobs/{job}/trend"), 409, "conflict")
+    figure = served_batch.server.get(f"/v1/jobs/{job}/figures/trend").json()
     assert figure["data"] == []
 
 
-def test_figure_page_and_report_show_the_trend(served: ServedBatch) -> None:
-    figure = served.server.get(f"/v1/jobs/{served.job}/figures/trend").json()
+def test_figure_page_and_report_show_the_trend(served_batch: ServedBatch) -> None:
+    figure = served_batch.server.get(f"/v1/jobs/{served_batch.job}/figures/trend").json()
     points = [one for one in figure["data"] if one["name"].endswith("estimate ± standard error")]
     assert [one["x"] for one in points] == [list(LENGTHS)] * 3
     assert all(len(one["error_y"]["array"]) == 4 for one in points)
     assert json.dumps(figure, allow_nan=False)
     query = {"outliers": "include"}
     for path in ("figures/trend", "trend"):
-        assert served.server.get(f"/v1/jobs/{served.job}/{path}", params=query).is_success
-        refused(served.server.get(f"/v1/jobs/{served.job}/{path}?outliers=some"), 422, "invalid")
-    page = served.server.get(f"/jobs/{served.job}").text
+        assert served_batch.server.get(
+            f"/v1/jobs/{served_batch.job}/{path}", params=query
+        ).is_success
+        refused(
+            served_batch.server.get(f"/v1/jobs/{served_batch.job}/{path}?outliers=some"),
+            422,
+            "invalid",
+        )
+    page = served_batch.server.get(f"/jobs/{served_batch.job}").text
     assert "Trend over length [m]" in page
     assert "L = (0.0" in page
-    report = served.server.get(f"/v1/jobs/{served.job}/report").text
+    report = served_batch.server.get(f"/v1/jobs/{served_batch.job}/report").text
     assert 'id="figure-trend"' in report
 
 
 @pytest.fixture
-def command(served: ServedBatch, monkeypatch: pytest.MonkeyPatch) -> CliRunner:
+def command(served_batch: ServedBatch, monkeypatch: pytest.MonkeyPatch) -> CliRunner:
     """The command line against this server; jobs are carried out while it waits."""
 
     def connected(*_: object) -> Client:
-        return Client("http://testserver", transport=Through(served.server))
+        return Client("http://testserver", transport=Through(served_batch.server))
 
     def follow(opened: Client, job: str, *, quiet: bool = False) -> dict[str, Any]:
-        carried_out(served.parts, job)
+        carried_out(served_batch.parts, job)
         return opened.job(job)
 
     monkeypatch.setattr(common, "connect_client", connected)
@@ -319,7 +327,7 @@ def command(served: ServedBatch, monkeypatch: pytest.MonkeyPatch) -> CliRunner:
 
 
 def test_the_command_uploads_prints_and_accepts(
-    served: ServedBatch, command: CliRunner, tmp_path: Any
+    served_batch: ServedBatch, command: CliRunner, tmp_path: Any
 ) -> None:
     words = [
         "reidentify",

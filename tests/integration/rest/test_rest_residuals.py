@@ -3,7 +3,6 @@
 import html
 import json
 import re
-from collections.abc import Iterator
 from contextlib import nullcontext
 from typing import Any, NamedTuple
 
@@ -13,7 +12,6 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.api.app import create_app
 from service.api.dependencies import Parts
 from service.cli import common
 from service.cli.runs import app as runs_app
@@ -25,7 +23,7 @@ from service.storage.objects import ObjectStore
 from sysid.data.records import Recording
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
-from tests.rest import awaited, parts_of, refused, settings_of, store_csv
+from tests.rest import awaited, parts_of, refused, store_csv
 
 N, STEP, NOISE = 500, 0.05, 0.02
 SMALL = {"population": 20, "generations": 40, "islands": 1}
@@ -76,23 +74,21 @@ def recording(seed: int) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    app = create_app(settings_of(tmp_path_factory.mktemp("residuals")))
-    with TestClient(app) as server:
-        data = [store_csv(server, recording(k), f"d{k}") for k in (1, 2)]
-        parts = parts_of(server)
-        body = {
-            "model": "fopdt",
-            "datasets": data[:1],
-            "hold": {"u": "zero"},
-            "algorithm": SMALL,
-            "parameters": BOUNDS,
-            "validation": {"fraction": 0.3},
-        }
-        models = {"axes": [{"path": "/model", "values": ["fopdt", "sopdt"]}]}
-        _, runs = identified(parts, {**body, "sweep": models})
-        _, other = identified(parts, {**body, "datasets": data[1:]})
-        yield Served(server, parts, data[0], runs, other[0])
+def served(server: TestClient) -> Served:
+    data = [store_csv(server, recording(k), f"d{k}") for k in (1, 2)]
+    parts = parts_of(server)
+    body = {
+        "model": "fopdt",
+        "datasets": data[:1],
+        "hold": {"u": "zero"},
+        "algorithm": SMALL,
+        "parameters": BOUNDS,
+        "validation": {"fraction": 0.3},
+    }
+    models = {"axes": [{"path": "/model", "values": ["fopdt", "sopdt"]}]}
+    _, runs = identified(parts, {**body, "sweep": models})
+    _, other = identified(parts, {**body, "datasets": data[1:]})
+    return Served(server, parts, data[0], runs, other[0])
 
 
 def result(served: Served, run: str) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """Runs simulated on new inputs and in closed loops, over REST, the client and the command line."""
 
 import json
-from collections.abc import Iterator
 from math import degrees, pi
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,14 +10,13 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.api.app import create_app
 from service.cli import common, runs
 from service.client.client import Client
 from service.formats.mcap import read_mcap
 from tests.catalogue_cases import ACTUATOR
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
-from tests.rest import recording, refused, settings_of, store_csv
+from tests.rest import parts_of, recording, refused, store_csv
 
 SMALL = {"population": 16, "generations": 25, "islands": 1}
 NEAR = {name: {"lower": 0.9 * value, "upper": 1.1 * value} for name, value in ACTUATOR.items()}
@@ -46,40 +44,38 @@ class Served(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    app = create_app(settings_of(tmp_path_factory.mktemp("simulated")))
-    with TestClient(app) as server:
-        parts = app.state.parts
-        pressure = "12e3*(0.55*sin(2.2*t) + 0.6*sin(5.65*t + 1) + 0.5*sin(14.5*t + 2))"
-        made = server.post(
-            "/v1/datasets:simulate",
-            json={
-                "model": "actuator",
-                "parameters": ACTUATOR,
-                "samples": 600,
-                "sample_time": 0.01,
-                "inputs": {"P_a": {"kind": "expression", "expression": pressure}},
-            },
-        )
-        assert made.status_code == 201, made.text
-        arm = {
+def served(server: TestClient) -> Served:
+    parts = parts_of(server)
+    pressure = "12e3*(0.55*sin(2.2*t) + 0.6*sin(5.65*t + 1) + 0.5*sin(14.5*t + 2))"
+    made = server.post(
+        "/v1/datasets:simulate",
+        json={
             "model": "actuator",
-            "datasets": [made.json()["id"]],
-            "algorithm": SMALL,
-            "parameters": {**NEAR, "theta(0)": {"fixed": 0}},
-        }
-        steps = store_csv(server, recording())
-        lag = {
-            "model": "fopdt",
-            "datasets": [steps],
-            "algorithm": SMALL,
-            "parameters": {"K": {"lower": 0, "upper": 10}, "L": {"upper": 5}, "T": {"upper": 10}},
-        }
-        _, [first] = identified(parts, arm)
-        _, [second] = identified(parts, lag)
-        job = server.post("/v1/jobs", json=lag).json()["id"]
-        [waiting] = Client("http://testserver", transport=Through(server)).runs(job)
-        yield Served(server, first, second, waiting["id"], steps)
+            "parameters": ACTUATOR,
+            "samples": 600,
+            "sample_time": 0.01,
+            "inputs": {"P_a": {"kind": "expression", "expression": pressure}},
+        },
+    )
+    assert made.status_code == 201, made.text
+    arm = {
+        "model": "actuator",
+        "datasets": [made.json()["id"]],
+        "algorithm": SMALL,
+        "parameters": {**NEAR, "theta(0)": {"fixed": 0}},
+    }
+    steps = store_csv(server, recording())
+    lag = {
+        "model": "fopdt",
+        "datasets": [steps],
+        "algorithm": SMALL,
+        "parameters": {"K": {"lower": 0, "upper": 10}, "L": {"upper": 5}, "T": {"upper": 10}},
+    }
+    _, [first] = identified(parts, arm)
+    _, [second] = identified(parts, lag)
+    job = server.post("/v1/jobs", json=lag).json()["id"]
+    [waiting] = Client("http://testserver", transport=Through(server)).runs(job)
+    return Served(server, first, second, waiting["id"], steps)
 
 
 def simulated(served: Served, run: str, body: dict[str, Any], **query: Any) -> dict[str, Any]:

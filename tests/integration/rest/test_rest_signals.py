@@ -10,7 +10,6 @@ import pytest
 from mcap.reader import make_reader
 from starlette.testclient import TestClient
 
-from service.api.app import create_app
 from service.api.dependencies import Parts
 from service.dispatch import fitted_signals
 from service.formats.mcap import read_fitted_outputs, read_mcap
@@ -19,7 +18,7 @@ from service.storage.errors import ObjectStoreFailed
 from service.storage.tables import Run
 from tests.identified import identified
 from tests.mcap_files import read_run_record
-from tests.rest import recording, settings_of, store_csv
+from tests.rest import parts_of, recording, store_csv
 from workers import job_queue, packing, tasks
 
 SMALL = {"population": 8, "generations": 5, "islands": 1}
@@ -34,27 +33,25 @@ class Served(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    app = create_app(settings_of(tmp_path_factory.mktemp("data")))
-    with TestClient(app) as server:
-        body = {
-            "model": "fopdt",
-            "datasets": [store_csv(server, recording())],
-            "algorithm": SMALL,
-            "reuse": False,
-            "keep_signals": True,
-            "sweep": {"axes": [{"path": "/noise/sigma", "values": SIGMAS}]},
-        }
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(job_queue, "choose_pack_size", lambda cost, waiting, slots: waiting)
-            for module, name in (  # however busy the machine is, the pack is not cut
-                (packing, "PACK_SECONDS"),
-                (packing, "FIRST_SLICE_SECONDS"),
-                (tasks, "PACK_LIMIT_SECONDS"),
-            ):
-                patched.setattr(module, name, 600.0)
-            _, runs = identified(app.state.parts, body)
-            yield Served(server, app.state.parts, runs, body)
+def served(server: TestClient) -> Iterator[Served]:
+    body = {
+        "model": "fopdt",
+        "datasets": [store_csv(server, recording())],
+        "algorithm": SMALL,
+        "reuse": False,
+        "keep_signals": True,
+        "sweep": {"axes": [{"path": "/noise/sigma", "values": SIGMAS}]},
+    }
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(job_queue, "choose_pack_size", lambda cost, waiting, slots: waiting)
+        for module, name in (  # however busy the machine is, the pack is not cut
+            (packing, "PACK_SECONDS"),
+            (packing, "FIRST_SLICE_SECONDS"),
+            (tasks, "PACK_LIMIT_SECONDS"),
+        ):
+            patched.setattr(module, name, 600.0)
+        _, runs = identified(parts_of(server), body)
+        yield Served(server, parts_of(server), runs, body)
 
 
 def rows(served: Served, runs: list[str]) -> list[Run]:

@@ -1,19 +1,17 @@
 """A run that needed a finer step is simulated, validated and exported with that step."""
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from service.api.app import create_app
 from service.formats.mcap import read_fitted_outputs
 from sysid.data.records import Channel
 from sysid.models.parse import parse_model
 from sysid.simulation.simulate import simulate
 from tests.identified import identified
-from tests.rest import parts_of, settings_of, store_csv
+from tests.rest import parts_of, store_csv
 
 N = 200
 TWO_LAGS: dict[str, Any] = {
@@ -43,7 +41,7 @@ class Served(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(server: TestClient) -> Served:
     random = np.random.default_rng(1)
     times = np.arange(N, dtype=np.float64)
     inlet = Channel("u", times, np.repeat(random.standard_normal(N // 5), 5).round(3), hold="zero")
@@ -51,18 +49,17 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     y = simulate(plant, [inlet], {"K": 2.0, "T": 8.0, "r": 0.02}, times=times).channel("y").values
     y = y + random.normal(0.0, 0.01, N)
     rows = [f"{t:g},{u:g},{v:.6f}" for t, u, v in zip(times, inlet.values, y, strict=True)]
-    with TestClient(create_app(settings_of(tmp_path_factory.mktemp("substeps")))) as server:
-        dataset = store_csv(server, "\n".join(["t,u,y", *rows, ""]).encode())
-        body = {
-            "model": TWO_LAGS,
-            "datasets": [dataset],
-            "hold": {"u": "zero"},
-            "algorithm": {"population": 16, "generations": 40},
-        }
-        _, (run,) = identified(parts_of(server), body)
-        found = server.get(f"/v1/runs/{run}").json()
-        series = {"kind": "series", "times": times.tolist(), "values": inlet.values.tolist()}
-        yield Served(server, run, dataset, found, {**series, "hold": "zero"})
+    dataset = store_csv(server, "\n".join(["t,u,y", *rows, ""]).encode())
+    body = {
+        "model": TWO_LAGS,
+        "datasets": [dataset],
+        "hold": {"u": "zero"},
+        "algorithm": {"population": 16, "generations": 40},
+    }
+    _, (run,) = identified(parts_of(server), body)
+    found = server.get(f"/v1/runs/{run}").json()
+    series = {"kind": "series", "times": times.tolist(), "values": inlet.values.tolist()}
+    return Served(server, run, dataset, found, {**series, "hold": "zero"})
 
 
 def test_the_result_has_its_substeps(served: Served) -> None:

@@ -21,8 +21,15 @@ from service.storage.garbage import (
 )
 from service.storage.objects import open_store
 from tests.stored import claimed, new_dataset
+from tests.stores import make_bucket
 
 AT_ONCE = timedelta(seconds=-5)
+
+
+@pytest.fixture
+def store(database, tmp_path):
+    """A folder beside SQLite and a bucket beside PostgreSQL; a contract has both stores."""
+    return open_store(f"file://{tmp_path}/objects" if database.is_sqlite else make_bucket())
 
 
 def garbage(database, store, older_than=AT_ONCE):

@@ -11,28 +11,19 @@ import pytest
 from service.core import computed
 from service.core.computed import FRESH_SECONDS, MAX_WAITING, REUSE_FACTOR, ComputedValues
 from service.core.errors import ServiceBusy
+from tests.clocks import SecondsClock
 from tests.limits import LIMIT_SECONDS
 
 
-class Clock:
-    """A clock that only tests move."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    made = Clock()
+def clock(monkeypatch: pytest.MonkeyPatch) -> SecondsClock:
+    made = SecondsClock()
     monkeypatch.setattr(computed, "FRESH_SECONDS", FRESH_SECONDS)
     monkeypatch.setattr(computed, "time", SimpleNamespace(monotonic=made))
     return made
 
 
-def counting(clock: Clock, seconds: float) -> tuple[list[int], Callable[[], int]]:
+def counting(clock: SecondsClock, seconds: float) -> tuple[list[int], Callable[[], int]]:
     """The results so far, and a computation that takes some time."""
     made: list[int] = []
 
@@ -44,7 +35,7 @@ def counting(clock: Clock, seconds: float) -> tuple[list[int], Callable[[], int]
     return made, compute
 
 
-def test_what_is_final_is_computed_once(clock: Clock) -> None:
+def test_what_is_final_is_computed_once(clock: SecondsClock) -> None:
     made, compute = counting(clock, 0.0)
     values = ComputedValues(2)
     for _ in range(3):
@@ -53,13 +44,15 @@ def test_what_is_final_is_computed_once(clock: Clock) -> None:
     assert made == [0]
 
 
-def test_what_may_change_and_takes_little_is_computed_each_time(clock: Clock) -> None:
+def test_what_may_change_and_takes_little_is_computed_each_time(clock: SecondsClock) -> None:
     _, compute = counting(clock, FRESH_SECONDS / 2)
     values = ComputedValues(2)
     assert [values.get("a", compute, is_final=False) for _ in range(3)] == [0, 1, 2]
 
 
-def test_what_may_change_and_takes_long_is_used_for_many_times_its_time(clock: Clock) -> None:
+def test_what_may_change_and_takes_long_is_used_for_many_times_its_time(
+    clock: SecondsClock,
+) -> None:
     _, compute = counting(clock, 1.0)
     values = ComputedValues(2)
     assert values.get("a", compute, is_final=False) == 0
@@ -69,7 +62,7 @@ def test_what_may_change_and_takes_long_is_used_for_many_times_its_time(clock: C
     assert values.get("a", compute, is_final=False) == 1
 
 
-def test_the_values_that_were_asked_for_last_are_remembered(clock: Clock) -> None:
+def test_the_values_that_were_asked_for_last_are_remembered(clock: SecondsClock) -> None:
     made, compute = counting(clock, 0.0)
     values = ComputedValues(2)
     for key in "abac":  # c takes the place of b
@@ -78,7 +71,7 @@ def test_the_values_that_were_asked_for_last_are_remembered(clock: Clock) -> Non
     assert values.get("b", compute, is_final=True) == len(made) - 1 == 3
 
 
-def test_what_failed_is_tried_again(clock: Clock) -> None:
+def test_what_failed_is_tried_again(clock: SecondsClock) -> None:
     values = ComputedValues(2)
 
     def fail() -> int:

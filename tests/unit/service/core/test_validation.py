@@ -63,19 +63,19 @@ def test_a_sentence_tells_what_was_found_and_what_would_be_right(
     assert told(kind, value) == sentence
 
 
-@pytest.mark.parametrize("error", list_all_errors(), ids=lambda one: one["type"])
-def test_no_sentence_of_pydantic_is_told(error: Any) -> None:
+def test_no_sentence_of_pydantic_is_told() -> None:
+    errors = list_all_errors()
+    assert {error["type"] for error in errors} <= set(PYDANTIC_KINDS)
+    assert [error["type"] for error in errors if is_repeated(error)] == []
+
+
+def is_repeated(error: Any) -> bool:
+    """Whether our sentence has the longest piece of Pydantic's own."""
+    template = error["message_template_python"]
     context = {name: f"<{name}>" for name in error.get("example_context") or {}}
-    entry = {
-        "type": error["type"],
-        "loc": ("field",),
-        "input": 3,
-        "ctx": context,
-        "msg": error["message_template_python"],
-    }
-    longest = max(re.split(r"{\w+}", error["message_template_python"]), key=len)
-    assert error["type"] in PYDANTIC_KINDS
-    assert longest not in describe_error(entry, ["other"])
+    entry = {"type": error["type"], "loc": ("field",), "input": 3, "ctx": context, "msg": template}
+    longest = max(re.split(r"{\w+}", template), key=len)
+    return longest in describe_error(entry, ["other"])
 
 
 def test_an_unknown_field_that_is_one_elsewhere_is_told_with_its_place() -> None:

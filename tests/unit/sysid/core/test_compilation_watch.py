@@ -6,32 +6,23 @@ import pytest
 
 from sysid.core import jit
 from sysid.core.jit import COMPILATION_NOTE, CompilationWatch, announce_compilation
-
-
-class Clock:
-    """A clock that the test turns."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
+from tests.clocks import SecondsClock
 
 
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
+def clock() -> SecondsClock:
+    return SecondsClock(100.0)
 
 
 @pytest.fixture
-def watch(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> CompilationWatch:
+def watch(clock: SecondsClock, monkeypatch: pytest.MonkeyPatch) -> CompilationWatch:
     """A watch of a process that has compiled nothing."""
     monkeypatch.setattr(jit, "_announce_once", cache(jit._announce_once.__wrapped__))
     return CompilationWatch(clock)
 
 
 def test_the_clock_stands_still_while_functions_are_compiled(
-    watch: CompilationWatch, clock: Clock
+    watch: CompilationWatch, clock: SecondsClock
 ) -> None:
     start = watch.read_clock()
     clock.now += 2
@@ -47,7 +38,9 @@ def test_the_clock_stands_still_while_functions_are_compiled(
     assert watch.read_clock() - start == 3
 
 
-def test_a_function_that_is_loaded_takes_its_time(watch: CompilationWatch, clock: Clock) -> None:
+def test_a_function_that_is_loaded_takes_its_time(
+    watch: CompilationWatch, clock: SecondsClock
+) -> None:
     start = watch.read_clock()
     with watch.watch_function():
         clock.now += 4
@@ -55,7 +48,7 @@ def test_a_function_that_is_loaded_takes_its_time(watch: CompilationWatch, clock
 
 
 def test_the_clock_goes_on_after_a_compilation_that_is_interrupted(
-    watch: CompilationWatch, clock: Clock
+    watch: CompilationWatch, clock: SecondsClock
 ) -> None:
     def compile_interrupted(depth: int) -> None:
         with watch.watch_function():
@@ -83,7 +76,7 @@ def test_only_the_search_is_announced_and_only_once(
 
 
 def test_what_is_compiled_unwatched_does_not_stop_the_clock(
-    watch: CompilationWatch, clock: Clock
+    watch: CompilationWatch, clock: SecondsClock
 ) -> None:
     start = watch.read_clock()
     watch.begin("sysid.data.interpolation")

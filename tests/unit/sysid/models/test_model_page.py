@@ -2,8 +2,6 @@
 
 import re
 
-import pytest
-
 from sysid.language.functions import FUNCTIONS
 from sysid.models.documents import parse_yaml
 from sysid.models.parse import parse_model
@@ -45,12 +43,13 @@ def test_the_example_of_the_page_is_a_model() -> None:
     assert parse_model(rest | parse_yaml(part)).name == "reactor"
 
 
-@pytest.mark.parametrize("field", [*FIELDS, *(f"solver.{name}" for name in SOLVER)])
-def test_every_field_of_a_model_is_on_the_page(field: str) -> None:
-    assert re.search(rf"^\|.*`{re.escape(field)}`.*\|.*\|.+\|$", PAGE, re.M)
+def test_every_field_of_a_model_is_on_the_page() -> None:
+    rows = [row for row in PAGE.splitlines() if re.fullmatch(r"\|.*\|.*\|.+\|", row)]
+    cells = "\n".join(row.rsplit("|", 3)[0] for row in rows)
+    names = [*FIELDS, *(f"solver.{name}" for name in SOLVER)]
+    assert [name for name in names if f"`{name}`" not in cells] == []
 
 
-@pytest.mark.parametrize("function", FUNCTIONS)
-def test_every_function_of_the_language_is_on_the_page(function: str) -> None:
+def test_every_function_of_the_language_is_on_the_page() -> None:
     [row] = re.findall(r"^\| functions \|(.*)\|$", PAGE, re.M)
-    assert re.search(rf"\b{function}\b", row)
+    assert set(FUNCTIONS) - set(re.findall(r"\b\w+\b", row)) == set()
