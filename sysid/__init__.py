@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from sysid.identification.identify import identify
     from sysid.models.catalogue.load import catalogue, load_model
     from sysid.models.parameters import Parameter
-    from sysid.results.result import Identification
+    from sysid.results.identification import Identification
     from sysid.simulation.problem import Problem
     from sysid.simulation.simulate import simulate
     from sysid.uncertainty.estimates import Estimate
@@ -116,7 +116,7 @@ _PUBLIC_NAMES = {
     "export.export": ("export_model",),
     "export.load": ("load_identified",),
     "identification.identify": ("identify",),
-    "results.result": ("Identification",),
+    "results.identification": ("Identification",),
     "models.catalogue.load": ("catalogue", "load_model"),
     "models.parameters": ("Parameter",),
     "simulation.problem": ("Problem",),

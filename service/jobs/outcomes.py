@@ -5,12 +5,11 @@ from collections.abc import Mapping, Sequence
 from sqlalchemy.orm import Session
 
 from service.core.job_fields import DATASETS_PATH
-from service.jobs.results import VERDICT_PARTS, read_verdict
 from service.jobs.schemas import OutcomeOut
 from service.repositories.outcomes import read_outcome_rows
 from service.storage.tables import Job
 
-_PARTS = (*VERDICT_PARTS, "warnings")
+_PARTS = ("verdict", "warnings")
 
 
 def read_outcomes(session: Session, jobs: Sequence[Job]) -> Mapping[str, OutcomeOut]:
@@ -25,12 +24,11 @@ def read_outcomes(session: Session, jobs: Sequence[Job]) -> Mapping[str, Outcome
             run=row.run,
             fit_estimation=row.fit_estimation,
             fit_validation=row.fit_validation,
-            trust=verdict["trust"],
-            verdict=verdict["text"],
-            warnings=len(row.parts["warnings"] or ()),
+            trust=row.parts["verdict"]["trust"],
+            verdict=row.parts["verdict"]["text"],
+            warnings=len(row.parts["warnings"]),
         )
         for row in read_outcome_rows(session, alike, _PARTS)
-        for verdict in [read_verdict(row.parts)]
     }
 
 

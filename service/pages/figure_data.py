@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
-from math import inf, nan
+from math import inf, isnan
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,6 @@ from sqlalchemy.orm import Session
 from service.core.errors import Conflict
 from service.datasets.recordings import load_recording
 from service.formats.mcap import FitRole, FittedOutput
-from service.jobs.results import is_free
 from service.jobs.stored_run import StoredRun
 from service.repositories.runs import RunRepository
 from service.runs.bands import load_bands
@@ -41,6 +40,7 @@ from sysid.results.figures import (
     label_fitness,
     to_signal_trace,
 )
+from sysid.uncertainty.estimates import Estimate
 
 
 def list_free_parameters(session: Session, stored: StoredRun) -> list[FreeParameter]:
@@ -54,7 +54,7 @@ def list_free_parameters(session: Session, stored: StoredRun) -> list[FreeParame
         return [
             _to_estimated_parameter(estimate, scales)
             for estimate in stored.estimates
-            if is_free(estimate)
+            if estimate.is_free
         ]
     if stored.model.rule is not None:
         return []  # only the result says which candidates are selected
@@ -76,11 +76,15 @@ def read_run_figure_data(session: Session, stored: StoredRun) -> RunFigureData:
         parameters=_match_history_width(list_free_parameters(session, stored), history),
         epoch=int((body["algorithm"].get("migration") or {}).get("every", 0)),
         migrations=sorted({migration.epoch for migration in runs.read_migrations(run.id)}),
-        islands=[
-            (_replace_none(island.get("champion_rms"), inf), island.get("refined_rms"))
-            for island in stored.result.get("islands", ())
+        islands=[]
+        if stored.result is None
+        else [
+            (inf if isnan(i.champion_rms) else i.champion_rms, i.refined_rms)
+            for i in stored.result.islands
         ],
-        correlation=_to_correlation(stored.result.get("correlation")),
+        correlation=None
+        if stored.result is None or stored.result.correlation is None
+        else {"names": stored.result.correlation.names, "matrix": stored.result.correlation.matrix},
     )
 
 
@@ -89,33 +93,23 @@ def read_corner_parameters(stored: StoredRun) -> tuple[list[CornerParameter], Fl
 
     There are none if no posterior was requested, or none could be sampled.
     """
-    posterior = stored.result.get("posterior") or {}
-    estimates = {estimate["name"]: estimate for estimate in stored.estimates}
-    samples = np.array(posterior.get("samples", ()), dtype=np.float64)
+    result = stored.result
+    if result is None or result.posterior is None:
+        return [], np.array([])
+    estimates = {estimate.name: estimate for estimate in result.parameters}
     parameters = [
         CornerParameter(
             **{
-                name: estimates[parameter["name"]][name]
+                name: getattr(estimates[parameter.name], name)
                 for name in ("name", "unit", "lower", "upper", "value", "stderr", "interval95")
             },
-            posterior95=parameter["interval95"],
-            samples=samples[:, column],
+            posterior95=parameter.interval95,
+            samples=result.posterior.samples[:, column],
         )
-        for column, parameter in enumerate(posterior.get("parameters", ()))
+        for column, parameter in enumerate(result.posterior.parameters)
     ]
-    correlation = _to_correlation(stored.result.get("correlation"))
-    return parameters, np.array([] if correlation is None else correlation["matrix"])
-
-
-def _to_correlation(stored: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
-    if not stored:
-        return None
-    rows = [[_replace_none(value, nan) for value in row] for row in stored["matrix"]]
-    return {"names": stored["names"], "matrix": rows}
-
-
-def _replace_none(value: float | None, otherwise: float) -> float:
-    return otherwise if value is None else value
+    correlation = result.correlation
+    return parameters, np.array([]) if correlation is None else correlation.matrix
 
 
 def _group_by_island(rows: Sequence[Any]) -> list[list[IslandImprovement]]:
@@ -165,16 +159,16 @@ def _infer_parameter(points: Sequence[IslandImprovement], column: int) -> FreePa
 
 
 def _to_estimated_parameter(
-    estimate: Mapping[str, Any], scales: Mapping[str, ParameterScale]
+    estimate: Estimate, scales: Mapping[str, ParameterScale]
 ) -> FreeParameter:
     return FreeParameter(
-        estimate["name"],
-        estimate.get("unit", "1"),
-        estimate["lower"],
-        estimate["upper"],
-        scales.get(estimate["name"], "linear"),
-        value=estimate["value"],
-        stderr=find_shown_error(estimate.get("stderr"), estimate["status"]),
+        estimate.name,
+        estimate.unit,
+        estimate.lower,
+        estimate.upper,
+        scales.get(estimate.name, "linear"),
+        value=estimate.value,
+        stderr=find_shown_error(estimate.stderr, estimate.status),
     )
 
 

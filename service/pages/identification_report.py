@@ -6,6 +6,7 @@ from typing import Any
 
 import yaml
 
+from service.core.documents import to_finite
 from service.figures.embed import templates_json, write_figures
 from service.pages.render import (
     draw_script,
@@ -14,11 +15,9 @@ from service.pages.render import (
     render_template,
     security_policy,
 )
-from service.pages.result_view import to_result_view
-from service.runs.result import to_result_document
 from sysid.results.figures import draw_figures, list_experiments
-from sysid.results.result import Identification
-from sysid.results.summary import find_output_unit
+from sysid.results.identification import Identification
+from sysid.results.result import find_output_unit
 
 MAX_EXPERIMENTS = 4
 
@@ -36,13 +35,25 @@ def render_identification_report(
         The request as text.
     """
     assert found.data is not None
-    unit = find_output_unit(found)
     document = yaml.safe_dump(
         dict(found.data.model.document), sort_keys=False, allow_unicode=True, width=100
     )
     return render_template(
         "report_identification.html",
-        run=to_result_view(to_result_document(found, seconds), found.data.model, unit, title),
+        run={
+            "title": title,
+            "unit": find_output_unit(found),
+            "best_rms": to_finite(found.rms),
+            "fit_estimation": found.fit_percent.estimation,
+            "fit_validation": found.fit_percent.validation,
+            "evaluations": found.evaluations,
+            "generations": found.generations,
+            "seconds": seconds,
+            "error": None,
+            "warnings": found.warnings,
+            "result": found,
+            "model": found.data.model,
+        },
         facts=list(facts.items()),
         figures=write_figures(_draw_all(found)),
         model=document,

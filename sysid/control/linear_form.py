@@ -43,7 +43,15 @@ class IdentifiedValue:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Covariance:
-    """Covariance (D, D) of the free parameters `names`, in products of their units."""
+    """Covariance of the free parameters, in products of their units.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Parameters of the rows and columns.
+    matrix : FloatArray, shape (D, D)
+        Rows of the matrix.
+    """
 
     names: tuple[str, ...]
     matrix: FloatArray

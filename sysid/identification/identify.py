@@ -30,7 +30,7 @@ from sysid.models.catalogue.load import ModelSource, resolve_model
 from sysid.models.delays import check_unused_settings
 from sysid.models.model import Model
 from sysid.models.units import check_signal_units
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.simulation.problem import Problem
 
 _PROGRESS_SECONDS = 0.25

@@ -32,8 +32,7 @@ from sysid.figures.signals import plot_response
 from sysid.figures.stack import stack_figures
 from sysid.figures.theme import Theme
 from sysid.residuals.residual_tests import CorrelationFunction
-from sysid.results.result import Identification
-from sysid.results.summary import find_output_unit
+from sysid.results.result import FullResult, find_output_unit
 from sysid.uncertainty.estimates import Estimate
 
 if TYPE_CHECKING:
@@ -49,7 +48,7 @@ _USUAL: tuple[FigureName, ...] = ("response", "residuals", "correlation", "water
 
 
 def plot_result(
-    found: Identification,
+    found: FullResult,
     names: Sequence[FigureName | Sequence[FigureName]],
     experiment: int,
     theme: Theme,
@@ -101,7 +100,7 @@ def _describe_missing_figure(name: FigureName) -> str:
 
 
 def draw_figures(
-    found: Identification, names: Sequence[FigureName], experiment: int = 0
+    found: FullResult, names: Sequence[FigureName], experiment: int = 0
 ) -> list[tuple[str, Figure]]:
     """Draw figures of a result that have data, each with its title.
 
@@ -130,7 +129,7 @@ def draw_figures(
 
 
 def _draw_response(
-    found: Identification, experiments: Sequence[ExperimentTraces], number: int
+    found: FullResult, experiments: Sequence[ExperimentTraces], number: int
 ) -> tuple[str, Figure]:
     from sysid.results.bands import compute_record_bands  # it imports the compiler
 
@@ -143,7 +142,7 @@ def _draw_response(
 
 
 def _draw_residuals(
-    found: Identification, experiments: Sequence[ExperimentTraces], number: int
+    found: FullResult, experiments: Sequence[ExperimentTraces], number: int
 ) -> tuple[str, Figure]:
     title = "Correlation of the residuals"
     if found.data is None:
@@ -161,11 +160,11 @@ def _draw_residuals(
     return title, plot_residuals(traces)
 
 
-def _draw_posterior(found: Identification) -> Figure:
-    posterior, uncertainty = found.posterior, found.uncertainty
+def _draw_posterior(found: FullResult) -> Figure:
+    posterior, correlation = found.posterior, found.correlation
     if posterior is None:
         return empty_figure()
-    estimates = {estimate.name: estimate for estimate in found.estimates}
+    estimates = {estimate.name: estimate for estimate in found.parameters}
     parameters = [
         CornerParameter(
             **{
@@ -177,28 +176,25 @@ def _draw_posterior(found: Identification) -> Figure:
         )
         for column, parameter in enumerate(posterior.parameters)
     ]
-    return plot_posterior(
-        parameters, np.array([]) if uncertainty is None else uncertainty.correlation
-    )
+    return plot_posterior(parameters, np.array([]) if correlation is None else correlation.matrix)
 
 
-def to_figure_data(found: Identification) -> RunFigureData:
+def to_figure_data(found: FullResult) -> RunFigureData:
     """Convert search and estimates of a result to the data of their figures."""
-    uncertainty = found.uncertainty
     return RunFigureData(
         id="",
         unit=find_output_unit(found),
         fitness_label=label_fitness("squares" if found.data is None else found.data.loss),
         generations=found.generations,
         evaluations=found.evaluations,
-        parameters=[_to_free_parameter(found, one) for one in found.estimates if one.is_free],
+        parameters=[_to_free_parameter(found, one) for one in found.parameters if one.is_free],
         history=[
             [IslandImprovement(*improvement) for improvement in island] for island in found.history
         ],
         islands=[(island.champion_rms, island.refined_rms) for island in found.islands],
         correlation=None
-        if uncertainty is None
-        else {"names": uncertainty.names, "matrix": uncertainty.correlation},
+        if found.correlation is None
+        else {"names": found.correlation.names, "matrix": found.correlation.matrix},
     )
 
 
@@ -207,7 +203,7 @@ def label_fitness(loss: LossKind) -> str:
     return "soft-l1 loss, as RMS" if loss == "soft-l1" else "RMS"
 
 
-def _to_free_parameter(found: Identification, estimate: Estimate) -> FreeParameter:
+def _to_free_parameter(found: FullResult, estimate: Estimate) -> FreeParameter:
     scales = {} if found.data is None else {p.name: p.scale for p in found.data.model.parameters}
     return FreeParameter(
         estimate.name,
@@ -220,7 +216,7 @@ def _to_free_parameter(found: Identification, estimate: Estimate) -> FreeParamet
     )
 
 
-def list_experiments(found: Identification) -> list[ExperimentTraces]:
+def list_experiments(found: FullResult) -> list[ExperimentTraces]:
     """List the records with measured and identified outputs; none without the fitted data."""
     data = found.data
     if data is None:

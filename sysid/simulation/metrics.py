@@ -33,7 +33,22 @@ def compute_fit_percent(measured: FloatArray, simulated: FloatArray) -> float:
 class ChannelMetrics:
     """Agreement of one output of one experiment, over its scored samples.
 
-    `span` holds the least and the largest measured value. The estimate holds for such amplitudes.
+    Attributes
+    ----------
+    experiment : int
+        Record, from 0.
+    output : str
+        Output of the model.
+    unit : str
+        Unit of the RMS.
+    samples : int
+        Scored samples.
+    rms : float
+        RMS error, in `unit`.
+    fit_percent : float
+        Fit, %; not a number if the output does not vary.
+    span : tuple of float
+        Least and largest measured value, in `unit`. The estimate holds for such amplitudes.
     """
 
     experiment: int

@@ -43,7 +43,7 @@ from service.repositories.datasets import DatasetRepository
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository, NewJob
 from service.repositories.lineage import LineageRepository
-from service.repositories.outcomes import read_parameters
+from service.repositories.outcomes import read_estimates
 from service.repositories.references import ReferenceRepository
 from service.repositories.results import list_results
 from service.repositories.runs import RunRepository
@@ -280,7 +280,7 @@ def show_results(at: Filled) -> None:
             assert len(jobs.list_page(order=order, limit=20, cursor=page.next).items) == 20
         rows = list_results(session, limit=5).items
         list_results(session, limit=5, cursor=f"{LARGE}:7", only_best=True)
-        read_parameters(session, [row.run for row in rows])
+        read_estimates(session, [row.run for row in rows])
         lineage = LineageRepository(session)
         lineage.list_links_to_children(["ds_1"], 17)
         lineage.list_links_to_parents(["job_1"], 17)

@@ -15,7 +15,7 @@ from service.formats.mcap import read_fitted_outputs
 from service.queue.packed_results import LAYOUTS, RESULT_ROWS, PackedResults, RowLayout, pack_rows
 from service.queue.run_writes import RunOutcome
 from service.storage.tables import Base
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from tests.runs import RECORDS, spec
 from workers.protocol import AdvanceRun, CompleteRun, RunConclusion
 from workers.tasks import process_pack
@@ -65,7 +65,7 @@ def test_a_row_has_the_values_of_its_run(complete: list[CompleteRun]) -> None:
     assert packed.estimates == {}
     told = encode(complete, reports_estimates=True).estimates
     assert told == {
-        run.run: {one.name: one.value for one in run.concluded.identification.estimates}
+        run.run: {one.name: one.value for one in run.concluded.identification.parameters}
         for run in complete
     }
 
