@@ -1,10 +1,12 @@
 """Results of runs that no search has found: for tests of what becomes of results."""
 
 from math import inf
+from typing import Any
 
 import numpy as np
 
 from service.dispatch.encoding import ResultEncoder
+from service.jobs.results import write_result_document
 from service.queue.leases import Lease, LeaseQueue
 from service.queue.packed_results import PackedResults
 from service.queue.run_writes import RunWriter
@@ -74,6 +76,11 @@ def conclude(
         ),
         rms_noise_free=rms / 2,
     )
+
+
+def write_result(**parts: Any) -> dict[str, Any]:
+    """The stored document of a run, with these parts in place of those of `conclude`."""
+    return {**write_result_document(conclude().identification, 1.0), **parts}
 
 
 def _build_estimate(name: str, value: float, stderr: float | None) -> Estimate:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from importlib.metadata import version
-from typing import Any
 
 import yaml
 
@@ -15,7 +14,7 @@ from service.pages.render import (
     render_template,
     security_policy,
 )
-from sysid.results.figures import draw_figures, list_experiments
+from sysid.results.figures import ResultFigures, list_report_figures
 from sysid.results.identification import Identification
 from sysid.results.result import find_output_unit
 
@@ -55,7 +54,9 @@ def render_identification_report(
             "model": found.data.model,
         },
         facts=list(facts.items()),
-        figures=write_figures(_draw_all(found)),
+        figures=write_figures(
+            list_report_figures(ResultFigures(found), MAX_EXPERIMENTS, names_each=False)
+        ),
         model=document,
         request=request,
         version=version("lagid"),
@@ -65,17 +66,3 @@ def render_identification_report(
         draw=draw_script(),
         templates=templates_json(),
     )
-
-
-def _draw_all(found: Identification) -> list[tuple[str, dict[str, Any]]]:
-    """Draw the figures of a job's report, in its order."""
-    experiments = range(min(len(list_experiments(found)), MAX_EXPERIMENTS))
-    each = [
-        titled
-        for name in ("response", "residuals")
-        for experiment in experiments
-        for titled in draw_figures(found, [name], experiment)
-    ]
-    others = draw_figures(found, ["convergence", "correlation", "posterior", "waterfall"])
-    distinct = dict(each)
-    return [*draw_figures(found, ["history"]), *distinct.items(), *others]
