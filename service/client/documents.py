@@ -51,10 +51,12 @@ class AgreementDocument(TypedDict):
     """unit of the RMS"""
     samples: int
     """scored samples"""
-    rms: float
+    rms: float | None
     """RMS error, in `unit`"""
     fit_percent: float | None
-    """fit, %; null if the output does not vary"""
+    """fit, %; not a number if the output does not vary"""
+    span: list[float | None]
+    """least and largest measured value, in `unit`. The estimate holds for such amplitudes"""
 
 
 class AgreementsDocument(TypedDict):
@@ -598,7 +600,7 @@ class ExportedModelDocument(TypedDict):
     """version of lagid that wrote it"""
     model: dict[str, Any]
     """model document"""
-    values: list[ExportedValueDocument]
+    values: list[IdentifiedValueDocument]
     """parameters and initial states"""
     covariance: CovarianceDocument | None
     """covariance of the free parameters"""
@@ -606,21 +608,6 @@ class ExportedModelDocument(TypedDict):
     """sampling of the data"""
     provenance: dict[str, Any]
     """run, job and data of the values"""
-
-
-class ExportedValueDocument(TypedDict):
-    """Value of a parameter or initial state."""
-
-    name: str
-    """name of the parameter, or of the initial state as ``x(0)``"""
-    value: float
-    """value, in `unit`"""
-    unit: str
-    """unit of value and standard error"""
-    stderr: float | None
-    """standard error, in `unit`; null without one"""
-    status: str
-    """status of the estimate"""
 
 
 class FaultDocument(TypedDict):
@@ -748,6 +735,21 @@ class IdentifiableCombinationDocument(TypedDict):
     """standard error of `value`, in the same unit"""
     is_local: bool
     """whether the combination holds near the estimate only, as a sum in place of ``K*exp(-E/300)``"""
+
+
+class IdentifiedValueDocument(TypedDict):
+    """Value of one parameter or initial state, estimated or given."""
+
+    name: str
+    """name of the parameter, or of the initial state as ``x(0)``"""
+    value: float | None
+    """value, in `unit`"""
+    unit: str
+    """unit of value and standard error"""
+    stderr: float | None
+    """standard error, in `unit`; none without one"""
+    status: str
+    """status of the estimate; empty if the value was given"""
 
 
 class ImprovementDocument(TypedDict):

@@ -34,15 +34,24 @@ class DescribedField(NamedTuple):
 
 
 def extend_by(kind: type) -> Callable[[type[Wire]], type[Wire]]:
-    """Extend a wire type by the fields of a dataclass."""
-    return lambda wire: _create(wire.__name__, wire, wire.__doc__, _list_fields(kind))
+    """Extend a wire type by the fields of a dataclass, but for those that it declares itself."""
+
+    def extend(wire: type[Wire]) -> type[Wire]:
+        fields = {
+            name: field
+            for name, field in _list_fields(kind).items()
+            if name not in wire.model_fields
+        }
+        return _create(wire.__name__, wire, wire.__doc__, fields)
+
+    return extend
 
 
 def extend_later_by(kind: type, **defaults: object) -> Callable[[type[Wire]], type[Wire]]:
-    """Extend a wire type by the fields of a dataclass whose value does not exist from the start.
+    """Extend a wire type in the same way if there is no value from the start.
 
-    They are sent as they were stored. Until then each is null, unless `defaults` say otherwise. A
-    field that the wire type declares itself stays as it is.
+    Its fields are sent as they were stored. Until then each is null, unless `defaults` say
+    otherwise.
     """
 
     def extend(wire: type[Wire]) -> type[Wire]:

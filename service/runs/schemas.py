@@ -22,9 +22,10 @@ from service.core.wire import (
 )
 from service.datasets.schemas import SeriesOut
 from service.models.schemas import ModelDocumentOut
-from sysid.control.linear_form import Covariance
+from sysid.control.linear_form import Covariance, IdentifiedValue
 from sysid.residuals.residual_tests import ResidualTest
 from sysid.results.result import Result
+from sysid.simulation.metrics import ChannelMetrics
 
 
 @extend_later_by(Result, parameters=[], warnings=[])
@@ -249,16 +250,6 @@ class ProfilesOut(RunProfilesOut):
     figure: FigureOut = Field(description="figure of the profiles, as Plotly JSON")
 
 
-class ExportedValueOut(Answer):
-    """Value of a parameter or initial state."""
-
-    name: str = Field(description="name of the parameter, or of the initial state as ``x(0)``")
-    value: float = Field(description="value, in `unit`")
-    unit: str = Field(description="unit of value and standard error")
-    stderr: float | None = Field(description="standard error, in `unit`; null without one")
-    status: str = Field(description="status of the estimate")
-
-
 class ExportedDataOut(Answer):
     """Sampling of the data."""
 
@@ -272,7 +263,9 @@ class ExportedModelOut(Answer):
     format: str = Field(description="name and version of this format")
     lagid: str | None = Field(description="version of lagid that wrote it")
     model: Annotated[Any, DescribedBy(ModelDocumentOut)] = Field(description="model document")
-    values: list[ExportedValueOut] = Field(description="parameters and initial states")
+    values: Annotated[Any, DescribedBy(list[describe_value(IdentifiedValue)])] = Field(
+        description="parameters and initial states"
+    )
     covariance: Annotated[Any, DescribedBy(describe_value(Covariance) | None)] = Field(
         description="covariance of the free parameters"
     )
@@ -370,15 +363,11 @@ class FreeRunIn(Body):
     )
 
 
+@extend_by(ChannelMetrics)
 class AgreementOut(Answer):
     """Fit of one output of one experiment (counted from 1); null if the output does not vary."""
 
     experiment: int = Field(description="record, from 1")
-    output: str = Field(description="output of the model")
-    unit: str = Field(description="unit of the RMS")
-    samples: int = Field(description="scored samples")
-    rms: float = Field(description="RMS error, in `unit`")
-    fit_percent: Finite = Field(description="fit, %; null if the output does not vary")
 
 
 class FreeRunOut(Answer):
