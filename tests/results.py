@@ -37,7 +37,7 @@ def conclude(
     return RunConclusion(
         Identification(
             valid=True,
-            parameters=tuple(_build_estimate(name, *pair) for name, pair in estimates.items()),
+            parameters=tuple(build_estimate(name, *pair) for name, pair in estimates.items()),
             rms=rms,
             rms_validation=None,
             fit_percent=FitPercent(90.0, None),
@@ -83,7 +83,8 @@ def write_result(**parts: Any) -> dict[str, Any]:
     return {**write_result_document(conclude().identification, 1.0), **parts}
 
 
-def _build_estimate(name: str, value: float, stderr: float | None) -> Estimate:
+def build_estimate(name: str, value: float, stderr: float | None) -> Estimate:
+    """An identified estimate with an interval of two standard errors."""
     ends = None if stderr is None else (value - 2.0 * stderr, value + 2.0 * stderr)
     unit = "s" if name in ("T", "L") else "1"
     return Estimate(name, unit, value, 0.0, 100.0, stderr, ends, "identified")

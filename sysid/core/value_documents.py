@@ -181,16 +181,24 @@ class _Encoders(dict[type, Callable[[Any], Any]]):
         raise TypeError(f"a document has no {kind.__name__}")
 
     def _make_field_encoder(self, kind: type) -> Callable[[Any], Any]:
+        """Make what encodes a class. Plain fields are taken as they are, without a look."""
         listed = list_fields(kind)
         names = tuple(field.name for field in listed)
+        numbers = [field.name for field in listed if _is_number(field.hint)]
+        others = [f.name for f in listed if not (_is_plain(f.hint) or _is_number(f.hint))]
         digits = {} if self._is_exact else {f.name: f.digits for f in listed if f.digits}
         get = attrgetter(*names) if len(names) > 1 else lambda value: (getattr(value, names[0]),)
 
         def encode_fields(value: object) -> dict[str, Any]:
-            document = {
-                name: item if (part := item.__class__) in _PLAIN else self[part](item)
-                for name, item in zip(names, get(value), strict=True)
-            }
+            document = dict(zip(names, get(value), strict=True))
+            for name in numbers:
+                item = document[name]
+                if item is not None and not (item.__class__ is float and isfinite(item)):
+                    document[name] = self[item.__class__](item)
+            for name in others:
+                item = document[name]
+                if item is not None:
+                    document[name] = self[item.__class__](item)
             for name, count in digits.items():
                 document[name] = _round(document[name], count)
             return document
@@ -212,6 +220,17 @@ class _Encoders(dict[type, Callable[[Any], Any]]):
         if value.size == 0:
             return {"shape": list(value.shape)}
         return self._encode_items(value.tolist())
+
+
+def _is_plain(hint: Any) -> bool:
+    """Whether all values of a declared type are documents themselves."""
+    if get_origin(hint) in (Union, UnionType):
+        return all(map(_is_plain, get_args(hint)))
+    return hint in _PLAIN or get_origin(hint) is Literal
+
+
+def _is_number(hint: Any) -> bool:
+    return hint is float or hint == float | None
 
 
 def _return_unchanged(value: Any) -> Any:

@@ -315,14 +315,17 @@ class ResultFigures:
 def list_searched_parameters(
     result: Result, scales: Mapping[str, ParameterScale]
 ) -> list[Parameter]:
-    """List the free parameters of a result, in the order of the history's columns."""
+    """List the free parameters of a result, in the order of the history's columns.
+
+    A bound at zero or below has no logarithm, so its axis is linear.
+    """
     return [
         Parameter(
             estimate.name,
             estimate.lower,
             estimate.upper,
             estimate.unit,
-            scales.get(estimate.name, "linear"),
+            scales.get(estimate.name, "linear") if estimate.lower > 0 else "linear",
         )
         for estimate in result.parameters
         if estimate.is_free

@@ -68,7 +68,7 @@ from service.storage.tables import (
 )
 from service.upkeep.retention import list_deleted_jobs, list_ended_jobs
 from tests.database import record_statements
-from tests.results import conclude, encode_results
+from tests.results import conclude, encode_results, write_result
 from tests.stored import claimed, new_dataset
 
 N_JOBS, N_RUNS, N_EVENTS, N_OTHERS = 3000, 2000, 3000, 2000
@@ -141,6 +141,7 @@ def filled(request: pytest.FixtureRequest) -> Filled:
             number="s.n + 2",
             state="'succeeded'",
             best_rms="1.0 + s.n",
+            result=f"'{json.dumps(write_result())}'",
             spec_hash=pad(f"h{number}", database),
             signals_sha256=pad(f"a{number}", database),
         )

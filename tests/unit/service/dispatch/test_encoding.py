@@ -58,7 +58,7 @@ def test_a_row_has_the_values_of_its_run(complete: list[CompleteRun]) -> None:
         assert (cells["id"], cells["spec_hash"]) == (run.run, run.spec.reuse_key)
         assert (cells["best_rms"], cells["evaluations"]) == (one.rms, one.evaluations)
         assert (cells["generations"], cells["seconds"]) == (one.generations, 0.25)
-        assert cells["fit_estimation"] == one.fit_percent
+        assert cells["fit_estimation"] == one.fit_percent.estimation
     assert packed.runs == ("run_1", "run_2", "run_3")
     assert packed.evaluations == sum(one.evaluations for one in found)
     assert packed.best_rms == min(one.rms for one in found)
