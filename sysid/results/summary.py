@@ -13,6 +13,7 @@ from sysid.core.text import (
     plain_estimate,
     plain_unit,
 )
+from sysid.core.value_documents import list_fields
 from sysid.residuals.residual_tests import ResidualTests
 from sysid.results.parts import OrderComparison, SearchEvidence
 from sysid.results.result import FullResult, find_output_unit
@@ -80,23 +81,23 @@ def to_frame(result: FullResult) -> Any:
         If pandas is not installed.
     """
     pandas = load_library("pandas", "to_pandas()")
-    unknown = float("nan")
-    rows = [
-        {
-            "value": estimate.value,
-            "stderr": unknown if estimate.stderr is None else estimate.stderr,
-            "low95": unknown if estimate.interval95 is None else estimate.interval95[0],
-            "high95": unknown if estimate.interval95 is None else estimate.interval95[1],
-            "unit": estimate.unit,
-            "status": estimate.status,
-            "lower": estimate.lower,
-            "upper": estimate.upper,
-            "reason": estimate.reason,
-        }
-        for estimate in result.parameters
-    ]
+    rows = [dict(_list_columns(estimate)) for estimate in result.parameters]
     names = [estimate.name for estimate in result.parameters]
     return pandas.DataFrame(rows, index=pandas.Index(names, name="parameter"))
+
+
+def _list_columns(estimate: Estimate) -> Iterator[tuple[str, object]]:
+    """List the columns of an estimate: its fields but for its name, the interval as two."""
+    unknown = float("nan")
+    yield "value", estimate.value
+    yield "stderr", unknown if estimate.stderr is None else estimate.stderr
+    low, high = (unknown, unknown) if estimate.interval95 is None else estimate.interval95
+    yield from (("low95", low), ("high95", high), ("unit", estimate.unit))
+    yield from (("status", estimate.status), ("lower", estimate.lower), ("upper", estimate.upper))
+    shown = {"name", "value", "stderr", "interval95", "unit", "status", "lower", "upper"}
+    for field in list_fields(Estimate):
+        if field.name not in shown:
+            yield field.name, getattr(estimate, field.name)
 
 
 def describe_residuals(tests: ResidualTests) -> str:
