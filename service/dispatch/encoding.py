@@ -26,6 +26,7 @@ from service.queue.packed_results import (
     Dialect,
     PackedResults,
     Row,
+    extract_estimates,
     pack_rows,
 )
 from service.repositories.history import pack_history, pack_migrants
@@ -146,18 +147,11 @@ def _build_row(run: CompleteRun, place: _SignalsPlace) -> Row:
             "evaluations": int(found.evaluations),
             "generations": int(found.generations),
             "seconds": float(run.seconds),
-            "estimates": write_json(_extract_estimates(result)),
+            "estimates": write_json(extract_estimates(result)),
             "result": write_json(result),
             **dict(zip(SIGNALS_COLUMNS, place, strict=True)),
         }
     )
-
-
-def _extract_estimates(result: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        parameter["name"]: {"value": parameter["value"], "stderr": parameter["stderr"]}
-        for parameter in result["parameters"]
-    }
 
 
 def _list_points(run: CompleteRun) -> Iterator[Any]:
