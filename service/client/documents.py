@@ -308,18 +308,42 @@ class ComparedRunDocument(TypedDict):
 
 
 class ComparedValueDocument(TypedDict):
-    """Estimate of a parameter by one run; `stderr` and `interval95` are null without errors."""
+    """Estimate of a parameter by one run."""
 
     run: str
     """identifier of the run"""
-    value: float
-    """estimate, in the parameter's unit"""
+    name: str
+    """name of the parameter, or of an initial state such as ``x(0)``"""
+    unit: str
+    """unit of its values"""
+    value: float | None
+    """estimate, in `unit`"""
+    lower: float | None
+    """lower bound of the search, in `unit`"""
+    upper: float | None
+    """upper bound of the search, in `unit`"""
     stderr: float | None
-    """standard error, in the parameter's unit; null without one"""
-    interval95: list[float] | None
-    """95 % interval, in the parameter's unit; null without errors"""
-    status: str
-    """status of the estimate"""
+    """standard error, in `unit`. If there is none, `reason` says why"""
+    interval95: list[float | None] | None
+    """both ends of the 95 % interval by the t distribution, in `unit`"""
+    status: Literal[
+        "identified",
+        "not settled",
+        "not validated",
+        "order-dependent",
+        "prediction-dependent",
+        "hold-dependent",
+        "ambiguous",
+        "group",
+        "at bound",
+        "unidentifiable",
+        "fixed",
+        "tied",
+        "unfinished",
+    ]
+    """identified, or why the value is not to be relied on"""
+    reason: str
+    """reason of the status, or of a missing standard error; empty if there is nothing to say"""
 
 
 class ComparisonDocument(TypedDict):

@@ -263,22 +263,18 @@ def compare_page(session: Session, runs: Sequence[str]) -> str:
     if len(runs) < 2:
         return render_template("compare.html", comparison=None)
     comparison = compare_runs(session, runs, same_data=False)
-    rows = []
-    for parameter in comparison.parameters:
-        texts_by_run = {
-            value.run: join_estimate(value.value, value.stderr, status=value.status)
-            for value in parameter.values
-        }
-        texts = [texts_by_run.get(run.run, "") for run in comparison.runs]
-        rows.append(
-            {
-                "name": parameter.name,
-                "unit": parameter.unit,
-                "differs": parameter.differs,
-                "texts": texts,
-            }
-        )
     ordered = [load_run(session, run.run) for run in comparison.runs]
+    rows = [
+        {
+            "name": parameter.name,
+            "unit": parameter.unit,
+            "differs": parameter.differs,
+            "texts": [
+                _write_estimate(stored, parameter.name, parameter.unit) for stored in ordered
+            ],
+        }
+        for parameter in comparison.parameters
+    ]
     first = ordered[0].model
     return render_template(
         "compare.html",
@@ -291,6 +287,16 @@ def compare_page(session: Session, runs: Sequence[str]) -> str:
         query=urlencode([("run", run) for run in runs]),
         height=signals.response_height(len(first.outputs), len(first.inputs)),
     )
+
+
+def _write_estimate(stored: StoredRun, name: str, unit: str) -> str:
+    """Write the estimate of a parameter; empty if the run has none in this unit."""
+    texts = (
+        join_estimate(one.value, one.stderr, status=one.status)
+        for one in stored.estimates
+        if (one.name, one.unit) == (name, unit)
+    )
+    return next(texts, "")
 
 
 def _name_datasets(

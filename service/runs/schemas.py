@@ -26,6 +26,7 @@ from sysid.control.linear_form import Covariance, IdentifiedValue
 from sysid.residuals.residual_tests import ResidualTest
 from sysid.results.result import Result
 from sysid.simulation.metrics import ChannelMetrics
+from sysid.uncertainty.estimates import Estimate
 
 
 @extend_later_by(Result, parameters=[], warnings=[])
@@ -303,18 +304,11 @@ class ComparedRunOut(Answer):
     evaluations: int = Field(description="simulations of the search")
 
 
+@extend_by(Estimate)
 class ComparedValueOut(Answer):
-    """Estimate of a parameter by one run; `stderr` and `interval95` are null without errors."""
+    """Estimate of a parameter by one run."""
 
     run: str = Field(description="identifier of the run")
-    value: float = Field(description="estimate, in the parameter's unit")
-    stderr: float | None = Field(
-        description="standard error, in the parameter's unit; null without one"
-    )
-    interval95: list[float] | None = Field(
-        description="95 % interval, in the parameter's unit; null without errors"
-    )
-    status: str = Field(description="status of the estimate")
 
 
 class ComparedParameterOut(Answer):
