@@ -181,12 +181,18 @@ class _Encoders(dict[type, Callable[[Any], Any]]):
         raise TypeError(f"a document has no {kind.__name__}")
 
     def _make_field_encoder(self, kind: type) -> Callable[[Any], Any]:
-        """Make what encodes a class. Plain fields are taken as they are, without a look."""
+        """Make what encodes a class.
+
+        For speed plain documents take texts and whole numbers as they are, without a look.
+        """
         listed = list_fields(kind)
         names = tuple(field.name for field in listed)
         numbers = [field.name for field in listed if _is_number(field.hint)]
-        others = [f.name for f in listed if not (_is_plain(f.hint) or _is_number(f.hint))]
-        digits = {} if self._is_exact else {f.name: f.digits for f in listed if f.digits}
+        others = [name for name in names if name not in numbers]
+        digits: dict[str, int] = {}
+        if not self._is_exact:
+            others = [f.name for f in listed if f.name in others and not _is_plain(f.hint)]
+            digits = {f.name: f.digits for f in listed if f.digits}
         get = attrgetter(*names) if len(names) > 1 else lambda value: (getattr(value, names[0]),)
 
         def encode_fields(value: object) -> dict[str, Any]:
