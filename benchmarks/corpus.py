@@ -25,7 +25,7 @@ import yaml
 
 from benchmarks.systems import OTHERS, PAPER
 from lagid import GeneticAlgorithm, Identification, Loss, Noise, identify, simulate
-from service.runs.result import to_result_document
+from service.jobs.results import write_result_document
 from sysid.core.types import FloatArray
 
 Table = dict[str, FloatArray]
@@ -369,7 +369,7 @@ def answer_case(case: Case) -> dict[str, Any]:
 
 def to_document(found: Identification) -> Any:
     """Write a result as the service stores it."""
-    return json.loads(json.dumps(to_result_document(found, 0.0)))
+    return json.loads(json.dumps(write_result_document(found, 0.0)))
 
 
 def list_cases() -> list[Case]:

@@ -370,7 +370,7 @@ def run_draw(task: tuple[str, int]) -> Outcome:
     draw = CASES[name](np.random.default_rng(seed))
     found = identify(draw.model, draw.records, prediction=draw.prediction, seed=seed)
     intervals = {}
-    for one in found.estimates:
+    for one in found.parameters:
         ends, true = one.interval95, draw.truth[one.name]
         intervals[one.name] = ends and (ends[0] <= true <= ends[1], 0.5 * (ends[1] - ends[0]))
     return Outcome(intervals, found.substeps, found.search.settled)

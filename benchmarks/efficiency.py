@@ -83,7 +83,7 @@ def identify_draws(model: Model, truth: dict[str, float], draws: int) -> Draws:
     rows = []
     for draw in range(draws):
         noise = SD * np.random.default_rng([7, draw]).standard_normal(SAMPLES)
-        estimates = identify(model, record(clean + noise), seed=draw + 1).estimates
+        estimates = identify(model, record(clean + noise), seed=draw + 1).parameters
         ends = [estimate.interval95 or (np.nan, np.nan) for estimate in estimates]
         rows.append([[estimate.value, *end] for estimate, end in zip(estimates, ends, strict=True)])
     table = np.array(rows)

@@ -21,7 +21,7 @@ from benchmarks.traps import make_record, respond
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
 from sysid.identification.identify import identify
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 
 DRAWS, QUICK = 60, 5
 """Plants of each kind and noise."""

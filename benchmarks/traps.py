@@ -21,7 +21,7 @@ from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.uncertainty.estimates import Estimate
 
 DRAWS, QUICK = 20, 4
@@ -176,7 +176,7 @@ def chatter(random: np.random.Generator) -> Draw:
 
 def find_estimate(found: Identification, name: str) -> Estimate:
     """The estimate of a parameter."""
-    return next(one for one in found.estimates if one.name == name)
+    return next(one for one in found.parameters if one.name == name)
 
 
 def count_errors(found: Identification, draw: Draw) -> float:

@@ -11,7 +11,7 @@ Examples
 >>> u = Channel("u", t, np.where(t < 1.0, 0.0, 1.0))
 >>> y = Channel("y", t, 2.0 * (1.0 - np.exp(-np.maximum(t - 1.8, 0.0) / 0.5)))
 >>> found = identify(load_model("fopdt"), Record((u,), (y,)))
->>> round(next(estimate.value for estimate in found.estimates if estimate.name == "L"), 2)
+>>> round(next(estimate.value for estimate in found.parameters if estimate.name == "L"), 2)
 0.8
 """
 

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from sysid.models.catalogue.load import catalogue as catalogue
     from sysid.models.catalogue.load import load_model as load_model
     from sysid.models.parameters import Parameter as Parameter
-    from sysid.results.result import Identification as Identification
+    from sysid.results.identification import Identification as Identification
     from sysid.simulation.problem import Problem as Problem
     from sysid.simulation.simulate import simulate as simulate
     from sysid.uncertainty.estimates import Estimate as Estimate

@@ -1,12 +1,22 @@
 """Results of runs that no search has found: for tests of what becomes of results."""
 
+from math import inf
+from typing import Any
+
+import numpy as np
+
 from service.dispatch.encoding import ResultEncoder
+from service.jobs.results import write_result_document
 from service.queue.leases import Lease, LeaseQueue
 from service.queue.packed_results import PackedResults
 from service.queue.run_writes import RunWriter
 from service.storage.sessions import Database
 from sysid.islands.state import RunState
-from sysid.results.result import Identification, SearchEvidence
+from sysid.residuals.residual_tests import ResidualTests
+from sysid.results.identification import Identification
+from sysid.results.parts import SearchEvidence
+from sysid.results.result import Agreements, FitPercent, Identifiability, KnownBefore
+from sysid.results.verdict import Verdict
 from sysid.search.state import Improvement, Migrant
 from sysid.uncertainty.estimates import Criteria, Estimate
 from tests.runs import spec
@@ -26,41 +36,55 @@ def conclude(
     """The conclusion of a run of `fopdt` with these estimates: value and standard error."""
     return RunConclusion(
         Identification(
-            estimates=tuple(_build_estimate(name, *pair) for name, pair in estimates.items()),
-            rms=rms,
-            fit_percent=90.0,
-            rms_validation=None,
-            fit_percent_validation=None,
             valid=True,
+            parameters=tuple(build_estimate(name, *pair) for name, pair in estimates.items()),
+            rms=rms,
+            rms_validation=None,
+            fit_percent=FitPercent(90.0, None),
+            agreement=Agreements((), ()),
             evaluations=evaluations,
             generations=generations,
             islands=(),
+            identifiability=Identifiability(None, (), np.zeros(0)),
+            criteria=Criteria(0.0, None, 0.0, samples, max(1, len(estimates))),
+            correlation=None,
+            noise_sd=None,
+            noise_colour=None,
+            noise_model="white",
+            correlation_times={},
+            noise_deviations=None,
+            residual_tests=ResidualTests("estimation", None, ()),
+            onset_delays=(),
+            data_bounds=(),
+            input_hold=(),
+            known_before=KnownBefore((), ()),
+            search=SearchEvidence(True, "starts", 10, 5),
+            posterior=None,
+            order_comparison=None,
+            delays=(),
+            verdict=Verdict("trustworthy", "trustworthy"),
+            warnings=(),
+            substeps=1,
+            selection=(),
             history=history,
             migrations=migrations,
-            uncertainty=None,
+            covariance=None,
+            degrees=inf,
             simulated=(),
             simulated_validation=(),
-            agreement=(),
-            agreement_validation=(),
-            warnings=(),
-            selection=(),
-            criteria=Criteria(0.0, None, 0.0, samples, max(1, len(estimates))),
-            residual_tests=None,
-            onset_delays=(),
-            correlation_times={},
-            input_holds=(),
-            data_bounds=(),
             sample_time=0.1,
-            search=SearchEvidence(True, "starts", 10, 5),
-            substeps=1,
-            known_before=(),
-            known_before_validation=(),
         ),
         rms_noise_free=rms / 2,
     )
 
 
-def _build_estimate(name: str, value: float, stderr: float | None) -> Estimate:
+def write_result(**parts: Any) -> dict[str, Any]:
+    """The stored document of a run, with these parts in place of those of `conclude`."""
+    return {**write_result_document(conclude().identification, 1.0), **parts}
+
+
+def build_estimate(name: str, value: float, stderr: float | None) -> Estimate:
+    """An identified estimate with an interval of two standard errors."""
     ends = None if stderr is None else (value - 2.0 * stderr, value + 2.0 * stderr)
     unit = "s" if name in ("T", "L") else "1"
     return Estimate(name, unit, value, 0.0, 100.0, stderr, ends, "identified")

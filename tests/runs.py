@@ -11,7 +11,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.islands.state import RunState
 from sysid.models.catalogue.load import copy_catalogue_document
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from tests.limits import LIMIT_SECONDS
 from workers.protocol import (
     CompleteRun,
@@ -129,7 +129,7 @@ def carry_out(executor: Executor, specs: Mapping[str, RunSpec]) -> Notebook:
 def bits(found: Identification) -> tuple[object, ...]:
     """Everything of a result that must not depend on where it was computed."""
     return (
-        tuple((one.name, one.value, one.stderr) for one in found.estimates),
+        tuple((one.name, one.value, one.stderr) for one in found.parameters),
         found.rms,
         found.evaluations,
         found.generations,

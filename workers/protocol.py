@@ -13,7 +13,7 @@ from sysid.data.noise import Noise
 from sysid.data.records import Record
 from sysid.identification.fingerprint import compute_fingerprint
 from sysid.islands.state import RunState
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.search.island import Island
 
 _WORKERS = Path(__file__).parent  # they split records and add noise

@@ -28,6 +28,7 @@ They are dictionaries with the field names of the interface, for type checkers a
 
 from typing import Any, Literal, NotRequired, TypedDict
 '''
+_LINE = 100
 _PLAIN_TYPES = {"string": "str", "integer": "int", "number": "float", "boolean": "bool"}
 _PLAIN_TYPES |= {"null": "None"}
 
@@ -80,9 +81,19 @@ def _write_class(name: str, schema: Schema) -> str:
     for field, kind in schema["properties"].items():
         text = _write_type(kind)
         is_required = field in schema.get("required", ())
-        lines.append(f"    {field}: {text if is_required else f'NotRequired[{text}]'}")
+        lines.append(_wrap_field(field, text if is_required else f"NotRequired[{text}]"))
         lines.append(f'    """{kind.get("description", field)}"""')
     return "\n".join(lines) + "\n"
+
+
+def _wrap_field(field: str, text: str) -> str:
+    """Write a field in one line, or as the formatter wraps a long list of names."""
+    line = f"    {field}: {text}"
+    if len(line) <= _LINE:
+        return line
+    head, _, inner = text.removesuffix("]").partition("[")
+    parts = [inner] if head == "NotRequired" else [f"{name}," for name in inner.split(", ")]
+    return "\n".join([f"    {field}: {head}[", *(f"        {part}" for part in parts), "    ]"])
 
 
 def _name_type(schema: str) -> str:

@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from sysid.data.records import Record, Recording
     from sysid.identification.arguments import ReadRecords
     from sysid.models.model import Model
-    from sysid.results.result import Identification
+    from sysid.results.identification import Identification
     from sysid.uncertainty.estimates import Posterior
 
 
@@ -360,10 +360,11 @@ def print_result(
 
     Warnings that are `printed` already are in the JSON only.
     """
-    from service.runs.result import to_result_document
-    from sysid.results.summary import describe_order, describe_residuals, find_output_unit
+    from service.jobs.results import write_result_document
+    from sysid.results.result import find_output_unit
+    from sysid.results.summary import describe_order, describe_residuals
 
-    document = to_result_document(result, seconds)
+    document = write_result_document(result, seconds)
     if output is not None:
         write_file(output, json.dumps(document, indent=2))
     if as_json:
@@ -384,26 +385,26 @@ def print_result(
     )
     unit = plain_unit(find_output_unit(result))
     out.print(
-        f"RMS {result.rms:.6g}{unit}, fit {_format_fit(result.fit_percent)}",
+        f"RMS {result.rms:.6g}{unit}, fit {_format_fit(result.fit_percent.estimation)}",
         markup=False,
         end="",
     )
-    if result.rms_validation is not None and result.fit_percent_validation is not None:
+    if result.rms_validation is not None and result.fit_percent.validation is not None:
         out.print(
             f"; validation RMS {result.rms_validation:.6g}{unit}, "
-            f"fit {_format_fit(result.fit_percent_validation, 'it hardly moves')}",
+            f"fit {_format_fit(result.fit_percent.validation, 'it hardly moves')}",
             markup=False,
             end="",
         )
     out.print(f"; {result.evaluations} simulations in {seconds:.2f} s", markup=False)
     if result.data_bounds:
         out.print(f"bounds from the data: {_format_bounds(result)}", markup=False, soft_wrap=True)
-    if any(result.known_before):
+    if any(known_before := result.known_before.estimation):
         out.print(
-            f"inputs known before the record: {_format_history_span(result.known_before)}",
+            f"inputs known before the record: {_format_history_span(known_before)}",
             markup=False,
         )
-    if result.residual_tests is not None and result.residual_tests.passed is not None:
+    if result.residual_tests.passed is not None:
         out.print(describe_residuals(result.residual_tests), markup=False, soft_wrap=True)
     if result.order_comparison is not None:
         out.print(describe_order(result.order_comparison), markup=False, soft_wrap=True)
@@ -439,7 +440,7 @@ def _print_posterior(posterior: "Posterior | None") -> None:
 def _format_bounds(result: "Identification") -> str:
     return ", ".join(
         f"{estimate.name} {estimate.lower:.3g} to {estimate.upper:.3g}"
-        for estimate in result.estimates
+        for estimate in result.parameters
         if estimate.name in result.data_bounds
     )
 

@@ -46,17 +46,21 @@ class AgreementDocument(TypedDict):
     """unit of the RMS"""
     samples: int
     """scored samples"""
-    rms: float
+    rms: float | None
     """RMS error, in `unit`"""
     fit_percent: float | None
-    """fit, %; null if the output does not vary"""
+    """fit, %; not a number if the output does not vary"""
+    span: list[float | None]
+    """least and largest measured value, in `unit`. The estimate holds for such amplitudes"""
+    line_rms: float | None
+    """RMS error of a straight line through the samples, in `unit`; not a number for less than three"""
 
 class AgreementsDocument(TypedDict):
-    """Agreement with both kinds of data."""
+    """Agreement of each output of each record."""
 
-    estimation: list[OutputAgreementDocument]
+    estimation: list[ChannelMetricsDocument]
     """with the estimation data"""
-    validation: list[OutputAgreementDocument]
+    validation: list[ChannelMetricsDocument]
     """with the validation data"""
 
 class AlgorithmInDocument(TypedDict):
@@ -167,6 +171,26 @@ class BatchLabelDocument(TypedDict):
     warnings: list[str]
     """warnings of these runs"""
 
+class ChannelMetricsDocument(TypedDict):
+    """Agreement of one output of one experiment, over its scored samples."""
+
+    experiment: int
+    """record, from 0"""
+    output: str
+    """output of the model"""
+    unit: str
+    """unit of the RMS"""
+    samples: int
+    """scored samples"""
+    rms: float | None
+    """RMS error, in `unit`"""
+    fit_percent: float | None
+    """fit, %; not a number if the output does not vary"""
+    span: list[float | None]
+    """least and largest measured value, in `unit`. The estimate holds for such amplitudes"""
+    line_rms: float | None
+    """RMS error of a straight line through the samples, in `unit`; not a number for less than three"""
+
 class ChannelDocument(TypedDict):
     """One channel of a dataset. `sample_time` is null if the sampling is irregular."""
 
@@ -214,20 +238,6 @@ class CoefficientDocument(TypedDict):
     """value, in the units of the law"""
     stderr: float
     """standard error of the value"""
-
-class CombinationDocument(TypedDict):
-    """Combination of parameters that the data determine, while they do not each of them."""
-
-    members: list[str]
-    """names of the parameters"""
-    expression: str
-    """the combination"""
-    value: float | None
-    """estimate of the combination; its unit follows from its parameters"""
-    stderr: float | None
-    """standard error of the combination, in the same unit"""
-    is_local: NotRequired[bool]
-    """whether it holds near the estimate only"""
 
 class ComparedParameterDocument(TypedDict):
     """Parameter that at least two runs have."""
@@ -282,18 +292,42 @@ class ComparedRunDocument(TypedDict):
     """simulations of the search"""
 
 class ComparedValueDocument(TypedDict):
-    """Estimate of a parameter by one run; `stderr` and `interval95` are null without errors."""
+    """Estimate of a parameter by one run."""
 
     run: str
     """identifier of the run"""
-    value: float
-    """estimate, in the parameter's unit"""
+    name: str
+    """name of the parameter, or of an initial state such as ``x(0)``"""
+    unit: str
+    """unit of its values"""
+    value: float | None
+    """estimate, in `unit`"""
+    lower: float | None
+    """lower bound of the search, in `unit`"""
+    upper: float | None
+    """upper bound of the search, in `unit`"""
     stderr: float | None
-    """standard error, in the parameter's unit; null without one"""
-    interval95: list[float] | None
-    """95 % interval, in the parameter's unit; null without errors"""
-    status: str
-    """status of the estimate"""
+    """standard error, in `unit`. If there is none, `reason` says why"""
+    interval95: list[float | None] | None
+    """both ends of the 95 % interval by the t distribution, in `unit`"""
+    status: Literal[
+        "identified",
+        "not settled",
+        "not validated",
+        "order-dependent",
+        "prediction-dependent",
+        "hold-dependent",
+        "ambiguous",
+        "group",
+        "at bound",
+        "unidentifiable",
+        "fixed",
+        "tied",
+        "unfinished",
+    ]
+    """identified, or why the value is not to be relied on"""
+    reason: str
+    """reason of the status, or of a missing standard error; empty if there is nothing to say"""
 
 class ComparisonDocument(TypedDict):
     """Comparison of runs, the best first; `unit` is that of the RMS."""
@@ -335,35 +369,17 @@ class ControllerDocument(TypedDict):
     saturated_percent: float
     """share of the samples at a limit, %"""
 
+class CorrelationMatrixDocument(TypedDict):
+    """Correlation matrix; its rows and columns are `names`."""
+
+    names: list[str]
+    """free parameters of the rows and columns"""
+    matrix: list[list[float | None]]
+    """rows of the matrix"""
+
 class CorrelationDocument(TypedDict):
     """Correlation function of residuals with its bands, and its test."""
 
-    experiment: int
-    """record, from 0"""
-    output: str
-    """output whose residuals are tested"""
-    test: Literal["whiteness", "independence"]
-    """whiteness: with their own past; independence: with an input"""
-    input: str | None
-    """input of the test; null for whiteness"""
-    outcome: Literal["passed", "failed", "not tested"]
-    """outcome of the test"""
-    reason: str
-    """why it was not tested, or what failed"""
-    samples: int
-    """residuals of the test"""
-    lags_tested: int
-    """lags of the statistic"""
-    inside95: float | None
-    """share of the values within the 95 % band"""
-    inside99: float | None
-    """share of the values within the 99 % band"""
-    statistic: float | None
-    """test statistic, χ² distributed if the model is true"""
-    degrees: float | None
-    """degrees of freedom of the statistic"""
-    p: float | None
-    """probability of such a statistic if the model is true"""
     period: float | None
     """time between two lags, s; null for irregular times"""
     lags: list[float]
@@ -374,20 +390,54 @@ class CorrelationDocument(TypedDict):
     """half width of the 95 % band at each lag"""
     band99: list[float]
     """half width of the 99 % band at each lag"""
+    experiment: int
+    """record, from 0"""
+    output: str
+    """output whose residuals are tested"""
+    test: Literal["whiteness", "independence"]
+    """whiteness: with their own past. Independence: with an input"""
+    input: str | None
+    """input of the test; none for whiteness"""
+    outcome: Literal["passed", "failed", "not tested"]
+    """outcome of the test"""
+    samples: int
+    """scored residuals of the test"""
+    lags_tested: int
+    """lags of the statistic"""
+    inside95: float | None
+    """share of the tested lags within the 95 % band"""
+    inside99: float | None
+    """share of the tested lags within the 99 % band"""
+    statistic: float | None
+    """test statistic, χ² distributed if the model is true"""
+    degrees: float | None
+    """degrees of freedom of the statistic"""
+    p: float | None
+    """probability of a larger statistic if the model is true"""
+    reason: str
+    """why it was not tested, or what failed"""
+
+class CovarianceDocument(TypedDict):
+    """Covariance of the free parameters, in products of their units."""
+
+    names: list[str]
+    """parameters of the rows and columns"""
+    matrix: list[list[float | None]]
+    """rows of the matrix"""
 
 class CriteriaDocument(TypedDict):
-    """Information criteria; smaller is better, on the same samples."""
+    """Information criteria, smaller is better; compare only models of the same samples."""
 
     aic: float | None
-    """Akaike's criterion; null where the residuals vanish"""
-    aicc: NotRequired[float | None]
-    """the same, corrected for few samples"""
+    """akaike's criterion; minus infinity where the residuals vanish"""
+    aicc: float | None
+    """the same, corrected for few samples; missing if there are not more than κ + 1"""
     bic: float | None
-    """Schwarz's criterion; null where the residuals vanish"""
+    """schwarz's criterion; minus infinity where the residuals vanish"""
     samples: int
-    """scored samples"""
+    """number n of scored samples"""
     parameters: int
-    """free parameters"""
+    """number D of free parameters"""
 
 class DatasetDocument(TypedDict):
     """A stored recording."""
@@ -480,10 +530,10 @@ class ErrorReferenceDocument(TypedDict):
     """why there are none, or what they mean"""
 
 class EstimateDocument(TypedDict):
-    """Estimate of one parameter."""
+    """One parameter's estimate."""
 
     name: str
-    """name of the parameter"""
+    """name of the parameter, or of an initial state such as ``x(0)``"""
     unit: str
     """unit of its values"""
     value: float | None
@@ -493,13 +543,27 @@ class EstimateDocument(TypedDict):
     upper: float | None
     """upper bound of the search, in `unit`"""
     stderr: float | None
-    """standard error, in `unit`; null: see `reason`"""
+    """standard error, in `unit`. If there is none, `reason` says why"""
     interval95: list[float | None] | None
-    """both ends of the 95 % interval, in `unit`"""
-    status: str
+    """both ends of the 95 % interval by the t distribution, in `unit`"""
+    status: Literal[
+        "identified",
+        "not settled",
+        "not validated",
+        "order-dependent",
+        "prediction-dependent",
+        "hold-dependent",
+        "ambiguous",
+        "group",
+        "at bound",
+        "unidentifiable",
+        "fixed",
+        "tied",
+        "unfinished",
+    ]
     """identified, or why the value is not to be relied on"""
     reason: str
-    """why there is no standard error; empty with one"""
+    """reason of the status, or of a missing standard error; empty if there is nothing to say"""
 
 class ExperimentDocument(TypedDict):
     """Measured and simulated outputs of one experiment."""
@@ -528,28 +592,14 @@ class ExportedModelDocument(TypedDict):
     """version of lagid that wrote it"""
     model: dict[str, Any]
     """model document"""
-    values: list[ExportedValueDocument]
+    values: list[IdentifiedValueDocument]
     """parameters and initial states"""
-    covariance: MatrixDocument | None
+    covariance: CovarianceDocument | None
     """covariance of the free parameters"""
     data: ExportedDataDocument
     """sampling of the data"""
     provenance: dict[str, Any]
     """run, job and data of the values"""
-
-class ExportedValueDocument(TypedDict):
-    """Value of a parameter or initial state."""
-
-    name: str
-    """name of the parameter, or of the initial state as ``x(0)``"""
-    value: float
-    """value, in `unit`"""
-    unit: str
-    """unit of value and standard error"""
-    stderr: float | None
-    """standard error, in `unit`; null without one"""
-    status: str
-    """status of the estimate"""
 
 class FaultDocument(TypedDict):
     """One fault of a request."""
@@ -571,13 +621,13 @@ class FigureDocument(TypedDict):
     layout: dict[str, Any]
     """layout, as Plotly defines it"""
 
-class FitDocument(TypedDict):
+class FitPercentDocument(TypedDict):
     """Fit, 100 (1 - ‖y - ŷ‖ / ‖y - ȳ‖) %."""
 
     estimation: float | None
-    """fit to the estimation data, %"""
+    """fit to the estimation data, %; not a number for a constant output"""
     validation: float | None
-    """fit to the validation data, %; null without them"""
+    """fit to the validation data, %; none without them"""
 
 class FreeRunDocument(TypedDict):
     """Measured and simulated outputs, and their agreement."""
@@ -649,11 +699,39 @@ class IdentifiabilityDocument(TypedDict):
     """What the data can tell apart, by the sensitivities at the estimate."""
 
     condition: float | None
-    """condition of the scaled sensitivities"""
-    groups: list[CombinationDocument]
-    """combinations that are determined"""
-    singular_values: NotRequired[list[float | None]]
+    """condition of the scaled sensitivities; none without standard errors"""
+    groups: list[IdentifiableCombinationDocument]
+    """combinations of parameters that are determined, while these are not each"""
+    singular_values: list[float | None]
     """singular values of the scaled sensitivities"""
+
+class IdentifiableCombinationDocument(TypedDict):
+    """A combination that the data determine, though not each of its parameters."""
+
+    members: list[str]
+    """names of the parameters of the combination"""
+    expression: str
+    """A product of powers, such as ``A_m*k_b/J``, or else a sum, such as ``T + L``"""
+    value: float | None
+    """estimate of the combination; its unit follows from its parameters"""
+    stderr: float | None
+    """standard error of `value`, in the same unit"""
+    is_local: bool
+    """whether the combination holds near the estimate only, as a sum in place of ``K*exp(-E/300)``"""
+
+class IdentifiedValueDocument(TypedDict):
+    """Value of one parameter or initial state, estimated or given."""
+
+    name: str
+    """name of the parameter, or of the initial state as ``x(0)``"""
+    value: float | None
+    """value, in `unit`"""
+    unit: str
+    """unit of value and standard error"""
+    stderr: float | None
+    """standard error, in `unit`; none without one"""
+    status: str
+    """status of the estimate; empty if the value was given"""
 
 class ImprovementDocument(TypedDict):
     """A better champion of one island."""
@@ -674,16 +752,16 @@ class InputHoldDocument(TypedDict):
 
     input: str
     """input of the model"""
-    chosen: str
+    chosen: Literal["zero", "first", "band-limited"]
     """how it was read"""
     reason: str | None
-    """reason of a choice by the values; null if given"""
-    other: str | None
-    """the other reading; null if it has no effect"""
+    """reason of a choice by the values; none if the hold was given"""
+    other: Literal["zero", "first", "band-limited"] | None
+    """the reading that was not chosen; none if the hold was given or has no effect"""
     estimates_other: dict[str, float | None] | None
-    """estimates with the other reading, in their units"""
+    """estimates of the free parameters with the other reading, from the estimates by least squares, in their units; none if they were not computed"""
     rms_other: float | None
-    """RMS error with the other reading, in the unit of `rms`"""
+    """RMS error with the other reading, in the unit of the result's `rms`"""
 
 class IslandInDocument(TypedDict):
     """Settings in which one island differs."""
@@ -695,17 +773,17 @@ class IslandInDocument(TypedDict):
     mutation: NotRequired[list[list[int | float]] | None]
     """pairs of a generation and, from it on, the probability of one flipped bit in a child"""
 
-class IslandDocument(TypedDict):
-    """Champion of one island before and after its refinement."""
+class IslandSummaryDocument(TypedDict):
+    """Champion of one island before and after refinement (for the waterfall plot)."""
 
     champion_rms: float | None
-    """RMS error of the search, in the unit of `rms`"""
+    """RMS error of the search, in the unit of the result's `rms`"""
     refined_rms: float | None
-    """RMS error after least squares, in the unit of `rms`; null without"""
-    evaluations: int
-    """simulations of the island"""
+    """RMS error after least squares, in the same unit; none without"""
     parameters: list[float | None]
     """values of the free parameters, in their units"""
+    evaluations: int
+    """simulations of the island"""
 
 class ItemDocument(TypedDict):
     """A stored item: its kind, its identifier (of a reference its name), and its name."""
@@ -822,9 +900,9 @@ class JobPageDocument(TypedDict):
 class KnownBeforeDocument(TypedDict):
     """Time before the start of each record for which its inputs are recorded."""
 
-    estimation: list[float]
+    estimation: list[float | None]
     """of each estimation record, s"""
-    validation: list[float]
+    validation: list[float | None]
     """of each validation record, s"""
 
 class LawDocument(TypedDict):
@@ -923,14 +1001,6 @@ class MarginsDocument(TypedDict):
     sensitivity_peak: float | None
     """largest sensitivity (M_s)"""
 
-class MatrixDocument(TypedDict):
-    """Matrix of a correlation or covariance; rows and columns are `names`."""
-
-    names: list[str]
-    """parameters of the rows and columns"""
-    matrix: list[list[float | None]]
-    """rows of the matrix"""
-
 class MigrantDocument(TypedDict):
     """One line of the migration log."""
 
@@ -967,17 +1037,17 @@ class MinimumDocument(TypedDict):
     parameters: dict[str, float | None]
     """values of the free parameters, in their units"""
     rms: float | None
-    """RMS error, in the unit of `rms`"""
-    likelihood_ratio: float | None
-    """n ln(Σe²/Σe²₀) to the best minimum"""
+    """RMS error, in the unit of the result's `rms`"""
     count: int
-    """least-squares fits that ended in it"""
+    """how many least-squares fits ended in it, in the search and after it"""
     independent: int
     """how many of them began at random points"""
+    likelihood_ratio: float | None
+    """n ln(Σe²/Σe²₀) to the best minimum, twice the logarithm of the ratio of likelihoods, made smaller for coloured residuals"""
     is_compatible: bool
     """whether the data do not rule it out"""
-    recorded_from: NotRequired[float | None]
-    """compared from this time of each record on, s; null: all of it"""
+    recorded_from: float | None
+    """compared from this time of each record on, s, where the input is recorded; none: all of it"""
 
 class ModelDocumentDocument(TypedDict):
     """A model document; its fields are explained in the documentation of models."""
@@ -1050,7 +1120,7 @@ class NoiseInDocument(TypedDict):
     """seed of the noise; the same seed gives the same noise"""
 
 class OnsetDelayDocument(TypedDict):
-    """Delay between the start of an input's change and that of an output's."""
+    """Onset delay of one output behind one input in one experiment."""
 
     experiment: int
     """record, from 0"""
@@ -1059,38 +1129,38 @@ class OnsetDelayDocument(TypedDict):
     output: str
     """output of the model"""
     delay: float | None
-    """median over the events, s; null: see `reason`"""
-    unit: str
-    """unit of delay and spread: s"""
+    """median over the events, s; if there is none, `reason` says why"""
     spread: float | None
-    """standard deviation over the events, s"""
+    """standard deviation over the events, s; none with fewer than two"""
     events: int
-    """clear events"""
+    """number of clear events among those examined"""
     threshold: float | None
-    """share of the change at which an output moves"""
+    """largest share of the excursion at which the output counted as moving"""
     reason: str
     """why there is no delay; empty with one"""
+    unit: str
+    """unit of delay and spread: s"""
 
 class OrderComparisonDocument(TypedDict):
-    """A process with dead time, with one order less and one more."""
+    """The model's order, one order less and one more, fitted to the same samples."""
 
     model: str
     """the catalogue's name of the model's own order"""
     preferred_model: str | None
-    """the one order that is open; null if there are several"""
+    """the one order that is open; none if there are several"""
     delay: str
-    """the parameter that is the dead time"""
+    """the model's parameter that is the dead time"""
     unit: str
     """unit of the dead times"""
-    delay_range: list[float]
+    delay_range: list[float | None]
     """smallest and largest dead time of the open orders, in `unit`"""
-    noise_model: str
-    """noise model of the criteria: white or ar1"""
+    noise_model: Literal["white", "ar1"]
+    """noise model of the criteria"""
     fits: list[OrderFitDocument]
     """the orders, the lowest first"""
 
 class OrderFitDocument(TypedDict):
-    """A process of one order, fitted to the same samples."""
+    """A process of one order, fitted to the samples of an identification."""
 
     model: str
     """its name in the catalogue"""
@@ -1099,13 +1169,13 @@ class OrderFitDocument(TypedDict):
     delay: float | None
     """dead time, in the comparison's `unit`"""
     delay_stderr: float | None
-    """standard error of the dead time, in the same unit; null without"""
+    """standard error of the dead time, in the same unit"""
     values: dict[str, float | None]
     """all parameters of that model, in their units"""
     rms: float | None
-    """RMS error, in the unit of `rms`"""
+    """RMS error, in the unit of the result's `rms`"""
     bic: float | None
-    """Schwarz's criterion; smaller is better"""
+    """schwarz's criterion, smaller is better; with the noise model of the comparison"""
     is_open: bool
     """whether its BIC is within 6 of the lowest: no strong evidence against it"""
 
@@ -1124,24 +1194,6 @@ class OutcomeDocument(TypedDict):
     """the verdict in words"""
     warnings: int
     """number of its warnings"""
-
-class OutputAgreementDocument(TypedDict):
-    """Agreement of one output of one record."""
-
-    experiment: int
-    """record, from 0"""
-    output: str
-    """output of the model"""
-    unit: str
-    """unit of the RMS"""
-    samples: int
-    """scored samples"""
-    rms: float | None
-    """RMS error, in `unit`"""
-    fit_percent: float | None
-    """fit, %; null if the output does not vary"""
-    span: NotRequired[list[float | None]]
-    """least and largest measured value, in `unit`"""
 
 class ParameterInDocument(TypedDict):
     """Changes of one parameter of the model."""
@@ -1202,24 +1254,26 @@ class PointDocument(TypedDict):
 class PosteriorDocument(TypedDict):
     """Samples of the posterior, or the reason why there are none."""
 
-    converged: bool
-    """whether the chain has converged"""
-    reason: str
-    """why it has not; empty if it has"""
+    parameters: list[PosteriorParameterDocument]
+    """the free parameters; empty without samples"""
+    samples: NotRequired[list[list[float | None]]]
+    """at most 1,000 of the samples, chosen at random, in the parameters' units; not in lists"""
+    correlation: CorrelationMatrixDocument
+    """correlation of the samples"""
     walkers: int
     """walkers of the chain"""
     steps: int
-    """steps of each walker"""
+    """steps of each walker, with those that are left out"""
     acceptance: float | None
     """share of the proposed moves that were accepted"""
     evaluations: int
     """simulations of the chain"""
-    parameters: list[PosteriorParameterDocument]
-    """free parameters"""
-    correlation: MatrixDocument
-    """correlation of the samples"""
-    samples: NotRequired[list[list[float]] | None]
-    """at most 1,000 samples, in the parameters' units; not in lists"""
+    converged: bool
+    """whether the chain has converged"""
+    reason: str
+    """why the chain has not converged, or why there is none; empty if it has"""
+    gain: float | None
+    """likelihood ratio of the best sample to the estimate; 0 if none is better"""
 
 class PosteriorParameterDocument(TypedDict):
     """Posterior distribution of one parameter."""
@@ -1228,12 +1282,12 @@ class PosteriorParameterDocument(TypedDict):
     """name of the parameter"""
     unit: str
     """unit of its values"""
-    median: float
+    median: float | None
     """median, in `unit`"""
-    interval95: list[float]
-    """2.5 and 97.5 % quantiles, in `unit`"""
+    interval95: list[float | None]
+    """the 2.5 and 97.5 % quantiles, in `unit`"""
     effective_samples: float | None
-    """number of independent samples"""
+    """number of independent samples that would estimate the mean as well"""
 
 class ProfileDocument(TypedDict):
     """Profile likelihood of one parameter."""
@@ -1327,11 +1381,11 @@ class ReasonDocument(TypedDict):
     """One finding about a result."""
 
     severity: Literal["note", "caution", "serious"]
-    """serious: do not rely on the estimates; caution: they hold under a condition; note: worth knowing"""
+    """serious: do not rely on the estimates. Caution: they hold under a condition. Note: worth knowing"""
     brief: str
-    """a few words, as they follow “trustworthy, but” or “not trustworthy:”"""
+    """A few words, as they follow “trustworthy, but” or “not trustworthy:”"""
     text: str
-    """what was found, and what helps"""
+    """whole sentences: what was found, and what helps"""
 
 class ReferenceDocument(TypedDict):
     """Reference: the run in use, its estimates, and earlier acceptances."""
@@ -1374,46 +1428,46 @@ class ReferenceValueDocument(TypedDict):
     """standard error, in the parameter's unit"""
 
 class ResidualTestDocument(TypedDict):
-    """One test of the residuals; numbers are null if it was not made."""
+    """One test of one output's residuals."""
 
     experiment: int
     """record, from 0"""
     output: str
     """output whose residuals are tested"""
     test: Literal["whiteness", "independence"]
-    """whiteness: with their own past; independence: with an input"""
+    """whiteness: with their own past. Independence: with an input"""
     input: str | None
-    """input of the test; null for whiteness"""
+    """input of the test; none for whiteness"""
     outcome: Literal["passed", "failed", "not tested"]
     """outcome of the test"""
-    reason: str
-    """why it was not tested, or what failed"""
     samples: int
-    """residuals of the test"""
+    """scored residuals of the test"""
     lags_tested: int
     """lags of the statistic"""
     inside95: float | None
-    """share of the values within the 95 % band"""
+    """share of the tested lags within the 95 % band"""
     inside99: float | None
-    """share of the values within the 99 % band"""
+    """share of the tested lags within the 99 % band"""
     statistic: float | None
     """test statistic, χ² distributed if the model is true"""
     degrees: float | None
     """degrees of freedom of the statistic"""
     p: float | None
-    """probability of such a statistic if the model is true"""
+    """probability of a larger statistic if the model is true"""
+    reason: str
+    """why it was not tested, or what failed"""
 
-class ResidualVerdictDocument(TypedDict):
-    """Outcome of the residual tests; all fields are missing if none were made."""
+class ResidualTestsDocument(TypedDict):
+    """All tests of a result."""
 
-    data: NotRequired[str | None]
+    data: Literal["estimation", "validation"]
     """data of the residuals"""
-    level: NotRequired[float | None]
-    """probability that a true model fails at least one test"""
-    passed: NotRequired[bool | None]
-    """whether all tests passed"""
-    tests: NotRequired[list[ResidualTestDocument]]
+    passed: bool | None
+    """whether all tests passed; none if nothing could be tested"""
+    tests: list[ResidualTestDocument]
     """each test"""
+    level: float | None
+    """probability that a true model fails at least one of its tests"""
 
 class ResidualsDocument(TypedDict):
     """Tests of a run's residuals with their correlation functions."""
@@ -1490,52 +1544,54 @@ class RunDocument(TypedDict):
     """generations so far"""
     seconds: NotRequired[float | None]
     """compute time, s"""
+    rms_noise_free: NotRequired[float | None]
+    """RMS error against the record without added noise, in the unit of `rms`"""
     valid: NotRequired[bool | None]
-    """whether the model can be simulated with the estimates"""
+    """whether the RMS error is below the safe limit"""
     parameters: NotRequired[list[EstimateDocument]]
     """estimates with their errors"""
     rms_validation: NotRequired[float | None]
-    """RMS error on the validation data, in the unit of `rms`"""
-    rms_noise_free: NotRequired[float | None]
-    """RMS error against the record without added noise, in the unit of `rms`"""
-    fit_percent: NotRequired[FitDocument | None]
-    """fit to both kinds of data"""
+    """RMS error on the validation data, in the unit of `rms`; none without them"""
+    fit_percent: NotRequired[FitPercentDocument | None]
+    """fit to both kinds of data, %"""
     agreement: NotRequired[AgreementsDocument | None]
     """agreement of each output of each record"""
-    islands: NotRequired[list[IslandDocument] | None]
+    islands: NotRequired[list[IslandSummaryDocument] | None]
     """champion of each island"""
     identifiability: NotRequired[IdentifiabilityDocument | None]
     """what the data can tell apart"""
     criteria: NotRequired[CriteriaDocument | None]
     """information criteria"""
-    correlation: NotRequired[MatrixDocument | None]
-    """correlation of the estimates; null without errors"""
+    correlation: NotRequired[CorrelationMatrixDocument | None]
+    """correlation of the estimates; none without errors"""
     noise_sd: NotRequired[float | None]
     """standard deviation of the weighted residuals, in the unit of `rms`"""
-    noise_colour: NotRequired[str | None]
-    """colour of the residuals that the errors assume"""
-    noise_model: NotRequired[str | None]
+    noise_colour: NotRequired[
+        Literal["white", "first-order", "coloured", "drifting", "clustered"] | None
+    ]
+    """colour of the residuals that the errors assume. If they drift over the whole record, the errors are lower bounds"""
+    noise_model: NotRequired[Literal["white", "ar1"] | None]
     """noise model of the estimates"""
-    correlation_times: NotRequired[dict[str, float] | None]
-    """correlation time of each output's noise, s"""
-    noise_deviations: NotRequired[list[list[float]] | None]
-    """relative deviation of the noise by experiment and output, by which residuals were divided; null if all count alike or weights were given"""
-    residual_tests: NotRequired[ResidualVerdictDocument | None]
-    """tests of the residuals; empty if none were made"""
+    correlation_times: NotRequired[dict[str, float | None] | None]
+    """correlation time of each output's noise, s, where the noise model has one"""
+    noise_deviations: NotRequired[list[list[float | None]] | None]
+    """relative deviation of the noise by experiment and output, by which residuals were divided; none if all count alike or weights were given"""
+    residual_tests: NotRequired[ResidualTestsDocument | None]
+    """tests of the residuals"""
     onset_delays: NotRequired[list[OnsetDelayDocument] | None]
     """delay between the start of an input's and an output's change"""
     data_bounds: NotRequired[list[str] | None]
-    """parameters whose bounds follow the data"""
+    """parameters whose bounds follow the data, unless given"""
     input_hold: NotRequired[list[InputHoldDocument] | None]
-    """how each input is read between its samples"""
+    """how each input is read between its samples, and the estimates if it were read otherwise"""
     known_before: NotRequired[KnownBeforeDocument | None]
-    """recorded time before the start of each record"""
-    search: NotRequired[SearchDocument | None]
+    """recorded time before the start of each record, s"""
+    search: NotRequired[SearchEvidenceDocument | None]
     """whether the search settled, and the minima that were found"""
     posterior: NotRequired[PosteriorDocument | None]
-    """samples of the posterior; null if not requested"""
+    """samples of the posterior; none if not requested"""
     order_comparison: NotRequired[OrderComparisonDocument | None]
-    """one order less and one more; null if not compared, or no process with delay"""
+    """one order less and one more; none if not compared, or no process with dead time"""
     delays: NotRequired[list[str] | None]
     """free parameters that time lags depend on"""
     verdict: NotRequired[VerdictDocument | None]
@@ -1543,7 +1599,7 @@ class RunDocument(TypedDict):
     warnings: NotRequired[list[str]]
     """what limits the result"""
     substeps: NotRequired[int | None]
-    """integration steps in one grid step"""
+    """integration steps in one grid step: the model's, or more"""
     selection: NotRequired[list[SelectedTermDocument] | None]
     """selected terms; empty if none were to be selected"""
 
@@ -1583,19 +1639,19 @@ class RunSimulationDocument(TypedDict):
     dataset: NotRequired[DatasetDocument | None]
     """stored result; null if it was not stored"""
 
-class SearchDocument(TypedDict):
-    """Evidence of the search."""
+class SearchEvidenceDocument(TypedDict):
+    """What a result knows of the whole search."""
 
     settled: bool
     """whether the search settled"""
-    because: str | None
-    """what shows it: starts or residuals"""
+    because: Literal["starts", "residuals"] | None
+    """what shows it; none if nothing does"""
     independent_starts: int
     """local searches from random points"""
     agreeing_starts: int
     """how many of them ended in the best minimum"""
     minima: list[MinimumDocument]
-    """minima, the lowest first"""
+    """minima in which least squares ended after the search, the lowest first"""
 
 class SegmentDocument(TypedDict):
     """Part of a recording that is identified as a separate experiment."""
@@ -1610,16 +1666,16 @@ class SegmentDocument(TypedDict):
     """values of the label columns"""
 
 class SelectedTermDocument(TypedDict):
-    """A term in the order of its selection."""
+    """A term in the order of selection."""
 
     term: str
     """the term"""
-    err: float
-    """share of the output's sum of squares that it explains"""
-    cumulated: float
+    err: float | None
+    """error-reduction ratio: the share of the output's sum of squares that this term explains in addition to the terms before it"""
+    cumulated: float | None
     """share explained with all terms so far"""
-    coefficient: float
-    """coefficient before the search; its unit follows from the term"""
+    coefficient: float | None
+    """coefficient in the model of all selected terms, before the search. It comes from one-step least squares, or from the free run if that selected the terms. Its unit follows from the term"""
 
 class SequenceInDocument(TypedDict):
     """The sequence search."""
@@ -1866,11 +1922,11 @@ class ValidationInDocument(TypedDict):
     """last part of each record that is compared, but not fitted"""
 
 class VerdictDocument(TypedDict):
-    """Whether the estimates can be relied on."""
+    """Whether the estimates of a result can be relied on."""
 
     trust: Literal["trustworthy", "limited", "not trustworthy"]
     """limited: the estimates hold under the condition that the text names"""
     text: str
-    """the verdict in words"""
+    """the verdict in words, such as “trustworthy, but L depends on the model's order”"""
     reasons: list[ReasonDocument]
-    """what speaks against it, the most severe first"""
+    """the most severe first; empty if nothing speaks against the result"""

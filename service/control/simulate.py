@@ -181,9 +181,9 @@ def _collect_values(stored: StoredRun, changes: Mapping[str, float]) -> dict[str
         if not isinstance(start, FixedInitial | DerivedInitial)
     }
     names = {parameter.name for parameter in model.parameters}
-    estimates = {p["name"]: p["value"] for p in stored.estimates if p["name"] in names}
+    estimates = {p.name: p.value for p in stored.estimates if p.name in names}
     # A tied parameter follows its expression, unless the request gives it a value.
-    tied = {p["name"] for p in stored.estimates if p["status"] == "tied"} if changes else set()
+    tied = {p.name for p in stored.estimates if p.status == "tied"} if changes else set()
     by_document = {p.name for p in model.parameters if p.tied is not None}
     untied = {name: value for name, value in estimates.items() if name not in tied & by_document}
     return {**rest, **untied, **changes}

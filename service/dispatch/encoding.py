@@ -17,6 +17,7 @@ from service.core.documents import to_finite
 from service.core.json_text import write_json
 from service.dispatch.results import to_history_points, to_migrant_points
 from service.formats.mcap import list_fitted_outputs, write_fitted_outputs
+from service.jobs.results import write_result_document
 from service.queue.packed_results import (
     HISTORY_ROWS,
     MIGRANT_ROWS,
@@ -25,10 +26,10 @@ from service.queue.packed_results import (
     Dialect,
     PackedResults,
     Row,
+    extract_estimates,
     pack_rows,
 )
 from service.repositories.history import pack_history, pack_migrants
-from service.runs.result import to_result_document
 from sysid.identification.fingerprint import compute_fingerprint
 from workers import protocol
 from workers.protocol import CompleteRun, Records
@@ -79,7 +80,7 @@ class ResultEncoder:
             float(min(rms)) if rms else None,
             {
                 run.run: {
-                    one.name: float(one.value) for one in run.concluded.identification.estimates
+                    one.name: float(one.value) for one in run.concluded.identification.parameters
                 }
                 for run in complete
                 if self.reports_estimates
@@ -130,7 +131,7 @@ def _build_row(run: CompleteRun, place: _SignalsPlace) -> Row:
     """Build the row of a run that succeeded."""
     found, noise_free = run.concluded.identification, to_finite(run.concluded.rms_noise_free)
     result = {
-        **to_result_document(found, run.seconds),
+        **write_result_document(found, run.seconds),
         "rms_noise_free": noise_free,
         **describe_program(),
     }
@@ -141,23 +142,16 @@ def _build_row(run: CompleteRun, place: _SignalsPlace) -> Row:
             "valid": bool(found.valid),
             "best_rms": to_finite(found.rms),
             "rms_noise_free": noise_free,
-            "fit_estimation": to_finite(found.fit_percent),
-            "fit_validation": to_finite(found.fit_percent_validation),
+            "fit_estimation": to_finite(found.fit_percent.estimation),
+            "fit_validation": to_finite(found.fit_percent.validation),
             "evaluations": int(found.evaluations),
             "generations": int(found.generations),
             "seconds": float(run.seconds),
-            "estimates": write_json(_extract_estimates(result)),
+            "estimates": write_json(extract_estimates(result)),
             "result": write_json(result),
             **dict(zip(SIGNALS_COLUMNS, place, strict=True)),
         }
     )
-
-
-def _extract_estimates(result: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        parameter["name"]: {"value": parameter["value"], "stderr": parameter["stderr"]}
-        for parameter in result["parameters"]
-    }
 
 
 def _list_points(run: CompleteRun) -> Iterator[Any]:

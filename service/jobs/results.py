@@ -1,34 +1,25 @@
-"""Readers of stored result documents."""
+"""Result documents: written from a result, and read back."""
 
 from collections.abc import Mapping
 from typing import Any
 
-from sysid.results.verdict import Verdict
+from sysid.core.value_documents import decode, encode, list_fields
+from sysid.results.result import FullResult, Result
+
+_NAMES = tuple(field.name for field in list_fields(Result))
 
 
-def is_free(estimate: Mapping[str, Any]) -> bool:
-    """Test whether an entry of ``parameters`` was estimated, that is, neither fixed nor tied."""
-    return estimate["status"] not in ("fixed", "tied")
+def write_result_document(result: FullResult, seconds: float) -> dict[str, Any]:
+    """Write the document of a result that took some time to compute (s)."""
+    return {**encode(result, Result), "seconds": seconds}
 
 
-def read_noise_model(result: Mapping[str, Any]) -> str:
-    """Read the noise model that the estimates used, whatever the request asked for."""
-    return "ar1" if any((result.get("correlation_times") or {}).values()) else "white"
+def read_result_document(document: Mapping[str, Any]) -> Result:
+    """Read a result from its document, which may say more of the run.
 
-
-def to_verdict_document(verdict: Verdict) -> dict[str, Any]:
-    """Convert a verdict to a part of a result document."""
-    return {
-        "trust": verdict.trust,
-        "text": verdict.text,
-        "reasons": [
-            {"severity": reason.severity, "brief": reason.brief, "text": reason.text}
-            for reason in verdict.reasons
-        ],
-    }
-
-
-def read_verdict(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Read the verdict of a result."""
-    verdict: dict[str, Any] = result["verdict"]
-    return verdict
+    Raises
+    ------
+    Misfit
+        If the document is not one of a result.
+    """
+    return decode(Result, {name: document[name] for name in _NAMES if name in document})

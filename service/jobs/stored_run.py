@@ -5,6 +5,7 @@ It is in `jobs` because a run's request is its job's. Everything that uses runs 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy.orm import Session
@@ -16,7 +17,7 @@ from service.datasets.recordings import read_records
 from service.datasets.rms_unit import find_rms_unit
 from service.datasets.signal_channels import SignalChannels, map_channels
 from service.jobs.job_parameters import list_job_parameters
-from service.jobs.results import read_noise_model
+from service.jobs.results import read_result_document
 from service.models.models import apply_result, load_stored_model
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
@@ -28,6 +29,7 @@ from sysid.data.noise import Noise
 from sysid.data.records import Record
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter, override_parameters
+from sysid.results.result import Result
 from sysid.uncertainty.estimates import Estimate
 
 if TYPE_CHECKING:
@@ -36,7 +38,7 @@ if TYPE_CHECKING:
     from sysid.simulation.problem import Problem
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class StoredRun:
     """Stored run with its request and model.
 
@@ -66,15 +68,19 @@ class StoredRun:
         return load_stored_model(self.body["model"])
 
     @property
-    def result(self) -> Mapping[str, Any]:
-        """The result document; empty until there is one."""
+    def document(self) -> Mapping[str, Any]:
+        """The stored document: the result, and what computed it; empty until there is one."""
         return self.run.result or {}
 
+    @cached_property
+    def result(self) -> Result | None:
+        """The result; None until there is one."""
+        return None if self.run.result is None else read_result_document(self.run.result)
+
     @property
-    def estimates(self) -> Sequence[Mapping[str, Any]]:
-        """The entries ``parameters`` of the result."""
-        estimates: Sequence[Mapping[str, Any]] = self.result.get("parameters") or ()
-        return estimates
+    def estimates(self) -> Sequence[Estimate]:
+        """The estimates of the result; none until there is one."""
+        return () if self.result is None else self.result.parameters
 
     @property
     def channels(self) -> SignalChannels:
@@ -124,11 +130,12 @@ class StoredRun:
 
         records = self.read_fit_records(session, store).estimation
         parameters = (*self.model.parameters, *build_initial_parameters(self.model, len(records)))
-        loss = {**self.body["loss"], "noise_model": read_noise_model(self.result)}
+        result = self.result
+        loss = {**self.body["loss"], "noise_model": result.noise_model if result else "white"}
         body = {**self.body, "parameters": self._changes(parameters), "loss": loss}
-        settings, noise = read_settings(FitSettings, body), self.result.get("noise_deviations")
-        if noise is not None:
-            settings = replace(settings, deviations=tuple(map(tuple, noise)))
+        settings = read_settings(FitSettings, body)
+        if result is not None and result.noise_deviations is not None:
+            settings = replace(settings, deviations=result.noise_deviations)
         return Problem.from_settings(self.model, records, settings)
 
     def resimulate(
@@ -147,23 +154,14 @@ class StoredRun:
         from sysid.identification.resimulate import resimulate_run
 
         model, records = self.model_of_request, self.read_fit_records(session, store)
-        substeps = self.result.get("substeps", model.solver.substeps)
-        estimates = [to_estimate(document) for document in self.estimates]
+        substeps = model.solver.substeps if self.result is None else self.result.substeps
         settings = read_settings(FitSettings, self.body)
-        return records, resimulate_run(model, records, settings, estimates, substeps)
+        return records, resimulate_run(model, records, settings, self.estimates, substeps)
 
     def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
         """Select the changes of these parameters. The request may name unselected terms."""
         names = {parameter.name for parameter in parameters}
         return {name: change for name, change in self.body["parameters"].items() if name in names}
-
-
-def to_estimate(document: Mapping[str, Any]) -> Estimate:
-    """Convert an entry ``parameters`` of a result, without its errors."""
-    value, lower, upper = (float(document[name]) for name in ("value", "lower", "upper"))
-    return Estimate(
-        document["name"], document["unit"], value, lower, upper, None, None, document["status"]
-    )
 
 
 def load_run(session: Session, run_id: str) -> StoredRun:

@@ -1,131 +1,117 @@
 """Load the data of figures: signals from the object store, results from stored rows."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import groupby
-from math import inf, nan
 from typing import Any
 
-import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.errors import Conflict
 from service.datasets.recordings import load_recording
 from service.formats.mcap import FitRole, FittedOutput
-from service.jobs.results import is_free
 from service.jobs.stored_run import StoredRun
 from service.repositories.runs import RunRepository
 from service.runs.bands import load_bands
 from service.runs.fitted import load_fitted_signals
-from service.runs.residuals import ResidualAnalysis, analyse_residuals
+from service.runs.residuals import analyse_residuals
 from service.storage.errors import ObjectMissing, RowNotFound
 from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
-from sysid.core.text import find_shown_error
-from sysid.figures.data import (
-    CornerParameter,
-    ExperimentTraces,
-    Floats,
-    FreeParameter,
-    IslandImprovement,
-    OutputTraces,
-    RunFigureData,
-    SignalTrace,
-)
-from sysid.models.parameters import Parameter, ParameterScale
+from sysid.figures.data import ExperimentTraces, OutputTraces, SearchTraces, SignalTrace
+from sysid.models.parameters import Parameter
 from sysid.results.figures import (
     RecordTraces,
+    TestedResiduals,
     add_bands,
     arrange_experiments,
     label_fitness,
+    list_searched_parameters,
     to_signal_trace,
 )
+from sysid.results.result import Result
+from sysid.search.state import Improvement
 
 
-def list_free_parameters(session: Session, stored: StoredRun) -> list[FreeParameter]:
+def list_free_parameters(session: Session, stored: StoredRun) -> list[Parameter]:
     """List the free parameters in the order of the history's columns.
 
     They come from the result once the run has ended; before, from the model and the request.
     """
     parameters = stored.parameters(session)
-    if stored.estimates:
+    if stored.result is not None:
         scales = {parameter.name: parameter.scale for parameter in parameters}
-        return [
-            _to_estimated_parameter(estimate, scales)
-            for estimate in stored.estimates
-            if is_free(estimate)
-        ]
+        return list_searched_parameters(stored.result, scales)
     if stored.model.rule is not None:
         return []  # only the result says which candidates are selected
-    return [_to_free_parameter(parameter) for parameter in parameters if parameter.is_free]
+    return [parameter for parameter in parameters if parameter.is_free]
 
 
-def read_run_figure_data(session: Session, stored: StoredRun) -> RunFigureData:
-    """Read the data of a run's search and result."""
-    job, run, body = stored.job, stored.run, stored.body
-    runs = RunRepository(session)
-    history = _group_by_island(runs.read_history(run.id))
-    return RunFigureData(
-        id=run.id,
-        unit=stored.rms_unit(session),
-        fitness_label=label_fitness(body["loss"]["kind"]),
-        generations=run.generations or (job.generation if job.n_runs == 1 else 0),
-        evaluations=run.evaluations,
-        history=history,
-        parameters=_match_history_width(list_free_parameters(session, stored), history),
-        epoch=int((body["algorithm"].get("migration") or {}).get("every", 0)),
-        migrations=sorted({migration.epoch for migration in runs.read_migrations(run.id)}),
-        islands=[
-            (_replace_none(island.get("champion_rms"), inf), island.get("refined_rms"))
-            for island in stored.result.get("islands", ())
-        ],
-        correlation=_to_correlation(stored.result.get("correlation")),
-    )
+@dataclass(frozen=True, eq=False)
+class StoredRunFigures:
+    """What the figures of a stored run are drawn from; a `sysid.results.figures.RunFigures`."""
 
+    session: Session
+    store: ObjectStore
+    stored: StoredRun
 
-def read_corner_parameters(stored: StoredRun) -> tuple[list[CornerParameter], Floats]:
-    """Read the samples of a run's posterior, and the correlation of its estimates (D, D).
+    @property
+    def result(self) -> Result | None:
+        """The result; None until there is one."""
+        return self.stored.result
 
-    There are none if no posterior was requested, or none could be sampled.
-    """
-    posterior = stored.result.get("posterior") or {}
-    estimates = {estimate["name"]: estimate for estimate in stored.estimates}
-    samples = np.array(posterior.get("samples", ()), dtype=np.float64)
-    parameters = [
-        CornerParameter(
-            **{
-                name: estimates[parameter["name"]][name]
-                for name in ("name", "unit", "lower", "upper", "value", "stderr", "interval95")
-            },
-            posterior95=parameter["interval95"],
-            samples=samples[:, column],
+    @cached_property
+    def search(self) -> SearchTraces:
+        """The search, so far."""
+        session, stored = self.session, self.stored
+        job, run, body, runs = stored.job, stored.run, stored.body, RunRepository(session)
+        history = _group_by_island(runs.read_history(run.id))
+        return SearchTraces(
+            unit=stored.rms_unit(session),
+            fitness_label=label_fitness(body["loss"]["kind"]),
+            generations=run.generations or (job.generation if job.n_runs == 1 else 0),
+            history=history,
+            parameters=_match_history_width(list_free_parameters(session, stored), history),
+            estimates={estimate.name: estimate for estimate in stored.estimates},
+            epoch=int((body["algorithm"].get("migration") or {}).get("every", 0)),
+            migrations=sorted({migration.epoch for migration in runs.read_migrations(run.id)}),
         )
-        for column, parameter in enumerate(posterior.get("parameters", ()))
-    ]
-    correlation = _to_correlation(stored.result.get("correlation"))
-    return parameters, np.array([] if correlation is None else correlation["matrix"])
+
+    @cached_property
+    def experiments(self) -> list[ExperimentTraces]:
+        """The records that the run was fitted to; empty until it has signals, or without data.
+
+        Outputs have their bands where these can be computed.
+        """
+        session, store, stored = self.session, self.store, self.stored
+        experiments = read_plain_experiments(session, store, stored)
+        if not experiments or not stored.estimates:
+            return experiments
+        try:
+            return add_bands(experiments, load_bands(session, store, stored))
+        except Conflict:  # no standard errors, or a dataset was deleted
+            return experiments
+
+    @cached_property
+    def residuals(self) -> TestedResiduals | None:
+        """The residuals that were tested; None until the run has signals, or without data."""
+        try:
+            analysis = analyse_residuals(self.session, self.store, self.stored)
+        except Conflict:
+            return None
+        return analysis and TestedResiduals(analysis.correlations, analysis.experiments)
 
 
-def _to_correlation(stored: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
-    if not stored:
-        return None
-    rows = [[_replace_none(value, nan) for value in row] for row in stored["matrix"]]
-    return {"names": stored["names"], "matrix": rows}
-
-
-def _replace_none(value: float | None, otherwise: float) -> float:
-    return otherwise if value is None else value
-
-
-def _group_by_island(rows: Sequence[Any]) -> list[list[IslandImprovement]]:
-    by_island: list[list[IslandImprovement]] = []
+def _group_by_island(rows: Sequence[Any]) -> list[list[Improvement]]:
+    by_island: list[list[Improvement]] = []
     for island, points in groupby(rows, key=lambda row: row.island):
         while len(by_island) < island:  # an island without any improvement yet
             by_island.append([])
         by_island.append(
             [
-                IslandImprovement(p.generation, p.evaluations, p.rms, p.phase, tuple(p.parameters))
+                Improvement(p.generation, p.evaluations, p.rms, p.phase, tuple(p.parameters))
                 for p in points
             ]
         )
@@ -133,91 +119,37 @@ def _group_by_island(rows: Sequence[Any]) -> list[list[IslandImprovement]]:
 
 
 def _match_history_width(
-    parameters: list[FreeParameter], history: Sequence[Sequence[IslandImprovement]]
-) -> list[FreeParameter]:
-    """Match the number of parameters to the history's columns; the model may have changed."""
+    parameters: list[Parameter], history: Sequence[Sequence[Improvement]]
+) -> list[Parameter]:
+    """Match the number of parameters to the history's columns; the model may have changed.
+
+    Bounds that follow the data are unknown: the range of the history is shown instead.
+    """
     points = [point for island in history for point in island]
     if not points:
         return parameters
     width = len(points[0].parameters)
-    parameters = [
-        _show_history(parameter, points, column) if parameter.follows_data else parameter
+    shown = [
+        _show_history(parameter, points, column) if parameter.bounds is not None else parameter
         for column, parameter in enumerate(parameters[:width])
     ]
-    unknown = range(min(len(parameters), width), width)
-    return parameters[:width] + [_infer_parameter(points, column) for column in unknown]
+    unknown = range(len(shown), width)
+    return shown + [
+        _show_history(Parameter(f"parameter {column + 1}", 0.0, 1.0), points, column)
+        for column in unknown
+    ]
 
 
-def _show_history(
-    parameter: FreeParameter, points: Sequence[IslandImprovement], column: int
-) -> FreeParameter:
-    """Replace unknown bounds by the range of the history."""
-    shown = _infer_parameter(points, column)
-    return replace(parameter, lower=shown.lower, upper=shown.upper)
-
-
-def _infer_parameter(points: Sequence[IslandImprovement], column: int) -> FreeParameter:
+def _show_history(parameter: Parameter, points: Sequence[Improvement], column: int) -> Parameter:
+    """Replace the bounds by the range of the history."""
     values = [point.parameters[column] for point in points]
     lower, upper = min(values), max(values)
-    return FreeParameter(
-        f"parameter {column + 1}", "1", lower, upper if upper > lower else lower + 1.0
-    )
-
-
-def _to_estimated_parameter(
-    estimate: Mapping[str, Any], scales: Mapping[str, ParameterScale]
-) -> FreeParameter:
-    return FreeParameter(
-        estimate["name"],
-        estimate.get("unit", "1"),
-        estimate["lower"],
-        estimate["upper"],
-        scales.get(estimate["name"], "linear"),
-        value=estimate["value"],
-        stderr=find_shown_error(estimate.get("stderr"), estimate["status"]),
-    )
-
-
-def _to_free_parameter(parameter: Parameter) -> FreeParameter:
-    return FreeParameter(
-        parameter.name,
-        parameter.unit,
-        parameter.lower,
-        parameter.upper,
-        parameter.scale,
-        follows_data=parameter.bounds is not None,
-    )
+    return replace(parameter, lower=lower, upper=upper if upper > lower else lower + 1.0)
 
 
 def read_dataset_traces(store: ObjectStore, dataset: Dataset) -> list[SignalTrace]:
     """Read the channels of a dataset."""
     return [to_signal_trace(channel) for channel in load_recording(store, dataset.sha256).channels]
-
-
-def read_residual_analysis(
-    session: Session, store: ObjectStore, stored: StoredRun
-) -> ResidualAnalysis | None:
-    """Analyse a run's residuals; None until it has signals, or without data."""
-    try:
-        return analyse_residuals(session, store, stored)
-    except Conflict:
-        return None
-
-
-def read_run_experiments(
-    session: Session, store: ObjectStore, stored: StoredRun
-) -> list[ExperimentTraces]:
-    """Read the records that a run was fitted to; empty until it has signals, or without data.
-
-    Outputs have their bands where these can be computed.
-    """
-    experiments = read_plain_experiments(session, store, stored)
-    if not experiments or not stored.estimates:
-        return experiments
-    try:
-        return add_bands(experiments, load_bands(session, store, stored))
-    except Conflict:  # no standard errors, or a dataset was deleted
-        return experiments
 
 
 def read_plain_experiments(

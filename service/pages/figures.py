@@ -10,14 +10,10 @@ from service.datasets.rms_unit import find_rms_unit
 from service.figures.noise import noise_group_keys, plot_noise_sweep
 from service.figures.trend import plot_trend
 from service.jobs.stored_run import load_run
-from service.pages.diagnostics import plot_residual_tests
 from service.pages.figure_data import (
-    read_corner_parameters,
+    StoredRunFigures,
     read_dataset_traces,
     read_plain_experiments,
-    read_residual_analysis,
-    read_run_experiments,
-    read_run_figure_data,
 )
 from service.pages.trend import load_trend
 from service.repositories.datasets import DatasetRepository
@@ -27,9 +23,8 @@ from service.storage.objects import ObjectStore
 from service.sweeps.summary import summarise_job
 from sysid.figures import plotly, signals
 from sysid.figures.plotly import Abscissa, Figure
-from sysid.figures.posterior import plot_posterior
 from sysid.figures.theme import Theme
-from sysid.results.figures import FigureName
+from sysid.results.figures import FigureLook, FigureName, draw_run_figure
 from sysid.trends.trend import OutlierRule
 
 
@@ -73,29 +68,13 @@ def load_run_figure(
     NotFound
         If the run or the requested experiment does not exist.
     """
-    stored = load_run(session, run_id)
-    if name == "response":
-        experiments = read_run_experiments(session, store, stored)
-        if not experiments:
-            return plotly.empty_figure()
-        _check_experiment(choice.experiment, len(experiments))
-        figure = signals.plot_response(experiments[choice.experiment], choice.start, choice.stop)
-        figure["layout"]["meta"]["experiments"] = [experiment.name for experiment in experiments]
-        return figure
-    if name == "residuals":
-        tested = read_residual_analysis(session, store, stored)
-        if tested is None:
-            return plotly.empty_figure()
-        _check_experiment(choice.experiment, len(tested.experiments))
-        return plot_residual_tests(tested, choice.experiment, min(choice.columns, 2))
-    if name == "posterior":
-        return plot_posterior(*read_corner_parameters(stored), is_narrow=choice.columns == 1)
-    data = read_run_figure_data(session, stored)
-    if name == "history":
-        return plotly.plot_history(data, choice.abscissa)
-    if name == "convergence":
-        return plotly.plot_convergence(data, choice.columns)
-    return plotly.plot_correlation(data) if name == "correlation" else plotly.plot_waterfall(data)
+    run = StoredRunFigures(session, store, load_run(session, run_id))
+    if name == "response" and run.experiments:
+        _check_experiment(choice.experiment, len(run.experiments))
+    elif name == "residuals" and run.residuals is not None:
+        _check_experiment(choice.experiment, len(run.residuals.experiments))
+    look = FigureLook(choice.abscissa, choice.columns, choice.start, choice.stop)
+    return draw_run_figure(run, name, choice.experiment, look)
 
 
 MAX_OVERLAID_RUNS = 8

@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 from importlib.metadata import version
-from typing import Any
 
 import yaml
 
+from service.core.documents import to_finite
 from service.figures.embed import templates_json, write_figures
 from service.pages.render import (
     draw_script,
@@ -14,11 +14,9 @@ from service.pages.render import (
     render_template,
     security_policy,
 )
-from service.pages.result_view import to_result_view
-from service.runs.result import to_result_document
-from sysid.results.figures import draw_figures, list_experiments
-from sysid.results.result import Identification
-from sysid.results.summary import find_output_unit
+from sysid.results.figures import ResultFigures, list_report_figures
+from sysid.results.identification import Identification
+from sysid.results.result import find_output_unit
 
 MAX_EXPERIMENTS = 4
 
@@ -36,15 +34,29 @@ def render_identification_report(
         The request as text.
     """
     assert found.data is not None
-    unit = find_output_unit(found)
     document = yaml.safe_dump(
         dict(found.data.model.document), sort_keys=False, allow_unicode=True, width=100
     )
     return render_template(
         "report_identification.html",
-        run=to_result_view(to_result_document(found, seconds), found.data.model, unit, title),
+        run={
+            "title": title,
+            "unit": find_output_unit(found),
+            "best_rms": to_finite(found.rms),
+            "fit_estimation": found.fit_percent.estimation,
+            "fit_validation": found.fit_percent.validation,
+            "evaluations": found.evaluations,
+            "generations": found.generations,
+            "seconds": seconds,
+            "error": None,
+            "warnings": found.warnings,
+            "result": found,
+            "model": found.data.model,
+        },
         facts=list(facts.items()),
-        figures=write_figures(_draw_all(found)),
+        figures=write_figures(
+            list_report_figures(ResultFigures(found), MAX_EXPERIMENTS, names_each=False)
+        ),
         model=document,
         request=request,
         version=version("lagid"),
@@ -54,17 +66,3 @@ def render_identification_report(
         draw=draw_script(),
         templates=templates_json(),
     )
-
-
-def _draw_all(found: Identification) -> list[tuple[str, dict[str, Any]]]:
-    """Draw the figures of a job's report, in its order."""
-    experiments = range(min(len(list_experiments(found)), MAX_EXPERIMENTS))
-    each = [
-        titled
-        for name in ("response", "residuals")
-        for experiment in experiments
-        for titled in draw_figures(found, [name], experiment)
-    ]
-    others = draw_figures(found, ["convergence", "correlation", "posterior", "waterfall"])
-    distinct = dict(each)
-    return [*draw_figures(found, ["history"]), *distinct.items(), *others]

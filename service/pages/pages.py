@@ -16,20 +16,17 @@ from service.figures.noise import noise_group_keys, noise_sweep_height
 from service.formats.file_kinds import SUFFIXES
 from service.items.items import compute_etag
 from service.jobs.outcomes import read_outcomes
-from service.jobs.results import read_verdict
 from service.jobs.stored_run import StoredRun, load_run
 from service.models import models
 from service.models.schemas import ModelOut
 from service.pages.cell_grid import build_cell_grid
 from service.pages.choices import DEFAULTS, list_choices
 from service.pages.dataset_links import count_unlisted_datasets, dataset_links
-from service.pages.diagnostics import to_diagnostics
 from service.pages.differences import list_differences
 from service.pages.figure_data import list_free_parameters
 from service.pages.guides import read_guide
 from service.pages.lineage import draw_lineage
 from service.pages.render import render_template
-from service.pages.result_view import to_model_view
 from service.pages.trend import TrendView, count_trend_flags, load_trend, to_trend_view
 from service.pages.views import (
     JobView,
@@ -58,6 +55,7 @@ from sysid.figures import signals
 from sysid.figures.plotly import WATERFALL_HEIGHT, convergence_height, correlation_height
 from sysid.figures.posterior import posterior_height
 from sysid.figures.residuals import residuals_height
+from sysid.results.result import Result
 from sysid.trends.trend import OutlierRule
 
 DATASET_ID = re.compile(r"\bds_[0-9a-z]{26}\b")
@@ -265,22 +263,18 @@ def compare_page(session: Session, runs: Sequence[str]) -> str:
     if len(runs) < 2:
         return render_template("compare.html", comparison=None)
     comparison = compare_runs(session, runs, same_data=False)
-    rows = []
-    for parameter in comparison.parameters:
-        texts_by_run = {
-            value.run: join_estimate(value.value, value.stderr, status=value.status)
-            for value in parameter.values
-        }
-        texts = [texts_by_run.get(run.run, "") for run in comparison.runs]
-        rows.append(
-            {
-                "name": parameter.name,
-                "unit": parameter.unit,
-                "differs": parameter.differs,
-                "texts": texts,
-            }
-        )
     ordered = [load_run(session, run.run) for run in comparison.runs]
+    rows = [
+        {
+            "name": parameter.name,
+            "unit": parameter.unit,
+            "differs": parameter.differs,
+            "texts": [
+                _write_estimate(stored, parameter.name, parameter.unit) for stored in ordered
+            ],
+        }
+        for parameter in comparison.parameters
+    ]
     first = ordered[0].model
     return render_template(
         "compare.html",
@@ -288,11 +282,21 @@ def compare_page(session: Session, runs: Sequence[str]) -> str:
         same_data=have_same_data(ordered),
         units=[stored.rms_unit(session) for stored in ordered],
         parameters=rows,
-        verdicts=[read_verdict(stored.result) for stored in ordered],
+        verdicts=[stored.result.verdict for stored in ordered if stored.result is not None],
         differences=_name_datasets(session, [stored.body for stored in ordered]),
         query=urlencode([("run", run) for run in runs]),
         height=signals.response_height(len(first.outputs), len(first.inputs)),
     )
+
+
+def _write_estimate(stored: StoredRun, name: str, unit: str) -> str:
+    """Write the estimate of a parameter; empty if the run has none in this unit."""
+    texts = (
+        join_estimate(one.value, one.stderr, status=one.status)
+        for one in stored.estimates
+        if (one.name, one.unit) == (name, unit)
+    )
+    return next(texts, "")
 
 
 def _name_datasets(
@@ -350,29 +354,34 @@ def dataset_page(session: Session, dataset_id: str) -> str:
 
 def load_run_row(session: Session, stored: StoredRun) -> RunView:
     """Load a run as a row of a table."""
-    return to_run_view(stored.run, stored.rms_unit(session), {})
+    return to_run_view(stored, stored.rms_unit(session), {})
 
 
 def load_full_run(session: Session, stored: StoredRun) -> RunView:
     """Load a run with the heights of its plots, so that the page reserves their room."""
-    run, result, model = stored.run, stored.result, stored.model
-    has_signals = run.state is JobState.SUCCEEDED
+    result, model = stored.result, stored.model
+    has_signals = stored.run.state is JobState.SUCCEEDED
     names = list_free_parameters(session, stored)
     counts = len(model.outputs), len(model.inputs)
     # Plots that appear when the run ends lie below the live plots; they get their room then.
     heights = {
         "response": signals.response_height(*counts) if has_signals else 0,
         "convergence": convergence_height(len(names), columns=3),
-        "correlation": correlation_height(len(names)) if result.get("correlation") else 0,
-        "residuals": _residuals_height(result) if has_signals else 0,
-        "waterfall": WATERFALL_HEIGHT if result.get("islands") else 0,
-        "posterior": posterior_height(len((result.get("posterior") or {}).get("parameters", ()))),
     }
-    return to_run_view(run, stored.rms_unit(session), heights, to_model_view(model))
+    if result is not None:
+        sampled = () if result.posterior is None else result.posterior.parameters
+        heights |= {
+            "correlation": correlation_height(len(names)) if result.correlation else 0,
+            "residuals": _residuals_height(result) if has_signals else 0,
+            "waterfall": WATERFALL_HEIGHT if result.islands else 0,
+            "posterior": posterior_height(len(sampled)) if sampled else 0,
+        }
+    return to_run_view(stored, stored.rms_unit(session), heights)
 
 
-def _residuals_height(result: Mapping[str, Any]) -> int:
-    n_figures = to_diagnostics(result).n_figures
+def _residuals_height(result: Result) -> int:
+    tests = result.residual_tests.tests
+    n_figures = sum(test.experiment == 0 and test.outcome != "not tested" for test in tests)
     return residuals_height(n_figures) if n_figures else 0
 
 

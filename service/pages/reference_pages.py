@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
-from typing import Any
 from urllib.parse import urlencode
 
 from sqlalchemy.orm import Session
@@ -14,15 +13,15 @@ from service.jobs.outcomes import read_outcomes
 from service.jobs.references import get_reference, list_references
 from service.jobs.stored_run import load_run
 from service.pages.render import render_template
-from service.pages.result_view import to_estimate_view
 from service.pages.trend import count_trend_flags
 from service.pages.views import to_job_view
 from service.repositories.jobs import JobRepository
 from service.repositories.lineage import LineageLink, LineageRepository
-from service.repositories.outcomes import read_parameters
+from service.repositories.outcomes import read_estimates
 from service.repositories.references import ReferenceRepository
 from service.repositories.search import ListFilter
 from sysid.core.text import format_unit, join_estimate
+from sysid.uncertainty.estimates import Estimate
 
 REFERENCES_PER_PAGE, JOBS_SHOWN = 50, 50
 LISTED_ESTIMATES = 4
@@ -42,7 +41,7 @@ def references_page(
 ) -> str:
     """Render the references in use, by name; `form` is the filter as typed."""
     page = list_references(session, cursor, REFERENCES_PER_PAGE, chosen)
-    parameters = read_parameters(session, [one.run for one in page.items])
+    estimates = read_estimates(session, [one.run for one in page.items])
     query = {"cursor": page.next, **form}
     return render_template(
         "references.html",
@@ -53,7 +52,7 @@ def references_page(
                 "by": one.by,
                 "at": one.at,
                 "labels": format_labels(one.labels),
-                "estimates": _summarise(parameters.get(one.run, [])),
+                "estimates": _summarise(estimates.get(one.run, ())),
             }
             for one in page.items
         ],
@@ -88,7 +87,7 @@ def reference_page(session: Session, name: str) -> str:
         etag=compute_etag(row),
         title=f"{stored.model.name}, {stored.job.name}",
         labels=format_labels(reference.labels),
-        estimates=[to_estimate_view(estimate) for estimate in stored.estimates],
+        estimates=stored.estimates,
         jobs=[
             to_job_view(job, find_rms_unit(session, job.spec), now, outcomes.get(job.id))
             for job in jobs
@@ -108,12 +107,12 @@ def _list_uses(links: Iterable[LineageLink]) -> dict[str, str]:
     return {job: ", ".join(dict.fromkeys(texts)) for job, texts in uses.items()}
 
 
-def _summarise(parameters: Iterable[Mapping[str, Any]]) -> str:
+def _summarise(estimates: Iterable[Estimate]) -> str:
     """Write the first estimates with errors and units in one line."""
     texts = [
-        f"{one['name']} = {join_estimate(one['value'], one['stderr'], status=one['status'])}"
-        f"{format_unit(one['unit'])}"
-        for one in parameters
+        f"{one.name} = {join_estimate(one.value, one.stderr, status=one.status)}"
+        f"{format_unit(one.unit)}"
+        for one in estimates
     ]
     more = ["…"] if len(texts) > LISTED_ESTIMATES else []
     return ", ".join(texts[:LISTED_ESTIMATES] + more)

@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
 from importlib.util import find_spec
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from markupsafe import Markup
 
 from service.core.root_path import get_root_path, to_address
 from service.core.text import TEMPLATE_FILTERS
+from service.pages.result_filters import RESULT_FILTERS
 from sysid.core.settings import GeneticAlgorithm
 
 if TYPE_CHECKING:
@@ -121,7 +123,8 @@ def template_environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(TEMPLATE_FILTERS)
+    environment.filters.update(TEMPLATE_FILTERS | RESULT_FILTERS)
+    environment.tests["finite"] = isfinite
     environment.globals["default_algorithm"] = GeneticAlgorithm()
     environment.globals["get_account"] = shown_account.get
     environment.globals.update(

@@ -20,13 +20,7 @@ from service.figures.trend import plot_trend
 from service.jobs.stored_run import StoredRun
 from service.pages.cell_grid import MAX_LISTED_RUNS, GridView, build_cell_grid
 from service.pages.dataset_links import count_unlisted_datasets, dataset_links
-from service.pages.diagnostics import plot_residual_tests
-from service.pages.figure_data import (
-    read_corner_parameters,
-    read_residual_analysis,
-    read_run_experiments,
-    read_run_figure_data,
-)
+from service.pages.figure_data import StoredRunFigures
 from service.pages.figures import FigureChoice, load_noise_figure
 from service.pages.pages import load_full_run, load_run_row
 from service.pages.render import (
@@ -43,9 +37,8 @@ from service.repositories.runs import RunOrder, RunRepository
 from service.storage.objects import ObjectStore
 from service.storage.tables import Job, Run
 from service.trends.schemas import TrendOut
-from sysid.figures import plotly, signals
 from sysid.figures.plotly import Figure
-from sysid.figures.posterior import plot_posterior
+from sysid.results.figures import TITLES, FigureName, draw_run_figure, list_report_figures
 
 MAX_RANKED_RUNS = 10
 MAX_FAILED_RUNS = 20
@@ -159,14 +152,9 @@ def _overview_drawings(
 def _build_section(
     session: Session, store: ObjectStore, stored: StoredRun, why: str
 ) -> _ReportSection:
-    data = read_run_figure_data(session, stored)
-    titled = [("Progress of every island", plotly.plot_history(data))]
-    experiments = read_run_experiments(session, store, stored)[:1]
-    titled += [
-        ("Measured against identified", signals.plot_response(experiment))
-        for experiment in experiments
-    ]
-    titled.append(("Convergence of the parameters", plotly.plot_convergence(data)))
+    run = StoredRunFigures(session, store, stored)
+    names: tuple[FigureName, ...] = ("history", "response", "convergence")
+    titled = [(TITLES[name], draw_run_figure(run, name)) for name in names]
     return _ReportSection(why, load_full_run(session, stored), _draw_figures(titled))
 
 
@@ -233,21 +221,5 @@ def _run_figures(
     session: Session, store: ObjectStore, stored: StoredRun
 ) -> list[tuple[str, int, Markup]]:
     """Title, height (px) and Plotly JSON of a run's figures that have data."""
-    data = read_run_figure_data(session, stored)
-    titled = [("Progress of every island", plotly.plot_history(data))]
-    for experiment in read_run_experiments(session, store, stored)[:MAX_EXPERIMENTS]:
-        title = f"Measured against identified: {experiment.name}"
-        titled.append((title, signals.plot_response(experiment)))
-    tested = read_residual_analysis(session, store, stored)
-    if tested is not None:
-        titled += [
-            (f"Correlation of the residuals: {name}", plot_residual_tests(tested, number))
-            for number, name in enumerate(tested.experiments[:MAX_EXPERIMENTS])
-        ]
-    titled += [
-        ("Convergence of the parameters", plotly.plot_convergence(data)),
-        ("Correlation of the estimates", plotly.plot_correlation(data)),
-        ("Posterior", plot_posterior(*read_corner_parameters(stored))),
-        ("What each island found", plotly.plot_waterfall(data)),
-    ]
-    return write_figures(titled)
+    run = StoredRunFigures(session, store, stored)
+    return write_figures(list_report_figures(run, MAX_EXPERIMENTS, names_each=True))

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 from urllib.parse import urlencode
 
 from sqlalchemy.orm import Session
@@ -11,17 +10,16 @@ from sqlalchemy.orm import Session
 from service.core.text import format_labels, name_label, write_csv
 from service.figures.results import ResultPoint, plot_results
 from service.jobs.job_links import find_model_name
-from service.jobs.results import is_free
 from service.pages.render import render_template
-from service.pages.result_view import EstimateView, to_estimate_view
 from service.pages.views import format_cell
 from service.repositories.results import ResultRow, list_results
 from service.repositories.search import ListFilter
 from service.storage.statements import RowPage
 from sysid.core.text import find_shown_error
 from sysid.figures.plotly import Figure, empty_figure
+from sysid.uncertainty.estimates import Estimate
 
-_Entry = tuple[ResultRow, Mapping[str, Any]]
+_Entry = tuple[ResultRow, Estimate]
 """A run, and what its result says of one parameter."""
 
 RUNS_PER_PAGE, RUNS_OF_A_FILE = 100, 1000
@@ -91,7 +89,7 @@ class ListedResult:
     row: ResultRow
     model: str
     place: str
-    estimate: EstimateView
+    estimate: Estimate
 
 
 def results_page(session: Session, choice: ResultChoice) -> str:
@@ -101,10 +99,8 @@ def results_page(session: Session, choice: ResultChoice) -> str:
     # Other pages, the figure and the file show what this page chose.
     query = {**choice.form, **({"parameter": parameter} if parameter else {})}
     listed = [
-        ListedResult(
-            row, find_model_name(row.job.spec), _describe_place(row), to_estimate_view(one)
-        )
-        for row, one in entries
+        ListedResult(row, find_model_name(row.job.spec), _describe_place(row), estimate)
+        for row, estimate in entries
     ]
     return render_template(
         "results.html",
@@ -127,13 +123,13 @@ def load_results_figure(session: Session, choice: ResultChoice) -> Figure:
     parameter, entries = _choose_parameter(page.items, choice.parameter)
     if not entries:
         return empty_figure()
-    unit = Counter(one["unit"] for _, one in entries).most_common(1)[0][0]
-    same = _put_oldest_first([(row, one) for row, one in entries if one["unit"] == unit])
+    unit = Counter(one.unit for _, one in entries).most_common(1)[0][0]
+    same = _put_oldest_first([(row, one) for row, one in entries if one.unit == unit])
     points = [
         ResultPoint(
             x=x,
-            value=one["value"],
-            stderr=find_shown_error(one["stderr"], one["status"]),
+            value=one.value,
+            stderr=find_shown_error(one.stderr, one.status),
             group=find_model_name(row.job.spec),
             text=f"{row.job.name}, run {row.number + 1}",
         )
@@ -150,10 +146,10 @@ def write_results_csv(session: Session, choice: ResultChoice) -> str:
     return write_csv([COLUMNS, *(_list_fields(row, one) for row, one in entries)])
 
 
-def _list_fields(row: ResultRow, one: Mapping[str, Any]) -> tuple[object, ...]:
+def _list_fields(row: ResultRow, one: Estimate) -> tuple[object, ...]:
     """List the fields of a line of the file, in the order of `COLUMNS`."""
-    stderr = find_shown_error(one["stderr"], one["status"])
-    low, high = (None if stderr is None else one["interval95"]) or (None, None)
+    stderr = find_shown_error(one.stderr, one.status)
+    low, high = (None if stderr is None else one.interval95) or (None, None)
     return (
         row.job.id,
         row.run,
@@ -161,13 +157,13 @@ def _list_fields(row: ResultRow, one: Mapping[str, Any]) -> tuple[object, ...]:
         row.job.name,
         find_model_name(row.job.spec),
         _describe_place(row),
-        one["name"],
-        one["value"],
+        one.name,
+        one.value,
         stderr,
         low,
         high,
-        one["unit"],
-        one["status"],
+        one.unit,
+        one.status,
         row.fit_estimation,
         row.finished_at.isoformat() if row.finished_at else None,
     )
@@ -193,14 +189,14 @@ def _choose_parameter(rows: Sequence[ResultRow], wanted: str) -> tuple[str, list
     """Choose the wanted parameter, or the most frequent one, and its entry of each run."""
     name = wanted or next(iter(_count_parameters(rows)), "")
     entries: list[_Entry] = [
-        (row, one) for row in rows for one in row.parameters if one["name"] == name and is_free(one)
+        (row, one) for row in rows for one in row.estimates if one.name == name and one.is_free
     ]
     return name, entries
 
 
 def _count_parameters(rows: Iterable[ResultRow]) -> list[str]:
     """List the names of the free parameters, the most frequent first."""
-    names = (one["name"] for row in rows for one in row.parameters if is_free(one))
+    names = (one.name for row in rows for one in row.estimates if one.is_free)
     return [name for name, _ in Counter(names).most_common()]
 
 

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any
 from urllib.parse import urlencode
 
@@ -191,7 +192,7 @@ def _load_form_context(session: Session, run_id: str, query: Mapping[str, str]) 
 
 def _suggest_controller(stored: StoredRun) -> dict[str, str]:
     """Suggest the PI controller that SIMC tunes for the model, if it does."""
-    model, values = stored.model, {e["name"]: e["value"] for e in stored.estimates}
+    model, values = stored.model, {e.name: e.value for e in stored.estimates}
     if not values or not model.inputs:
         return {}
     tuned = suggest_controller(model, values, model.inputs[0].name, model.outputs[0].name)
@@ -253,9 +254,9 @@ def _default_step(stored: StoredRun) -> dict[str, str]:
 
     A step from 0 to 1 would lie outside this range for most plants, such as outputs in Pa.
     """
-    agreement = (stored.result.get("agreement") or {}).get("estimation", [])
-    of_output = (entry for entry in agreement if entry["output"] == stored.model.outputs[0].name)
-    spans = [entry["span"] for entry in of_output if None not in entry["span"]]
+    agreement = () if stored.result is None else stored.result.agreement.estimation
+    of_output = (entry for entry in agreement if entry.output == stored.model.outputs[0].name)
+    spans = [entry.span for entry in of_output if all(map(isfinite, entry.span))]
     if not spans:
         return {}
     low, high = min(span[0] for span in spans), max(span[1] for span in spans)

@@ -12,26 +12,18 @@ from service.core.text import format_count, format_value
 from service.core.wire import Answer
 from service.items.items import compute_etag
 from service.jobs.outcomes import is_batch
-from service.jobs.results import read_verdict
 from service.jobs.schemas import JobOut, OutcomeOut
+from service.jobs.stored_run import StoredRun
 from service.jobs.submit import to_job_out
 from service.pages.choices import write_choice
-from service.pages.diagnostics import Diagnostics, to_diagnostics
-from service.pages.result_view import (
-    EstimateView,
-    ModelView,
-    PosteriorView,
-    to_estimate_view,
-    to_posterior_views,
-)
-from service.storage.tables import Event, Job, Run
+from service.storage.tables import Event, Job
 from sysid.core.text import rewrite_settings
 
 Document = Mapping[str, Any]
 
 
 class RunView(Answer):
-    """View of a run: its result or its progress."""
+    """View of a run: its progress, then its `Result`; None until there is one."""
 
     id: str
     number: int
@@ -40,7 +32,6 @@ class RunView(Answer):
     is_open: bool
     cell_text: str
     unit: str
-    valid: bool | None
     best_rms: float | None
     fit_estimation: float | None
     fit_validation: float | None
@@ -48,17 +39,14 @@ class RunView(Answer):
     generations: int
     seconds: float | None
     error: str | None
-    estimates: Sequence[EstimateView]
-    verdict: Mapping[str, Any] | None
+    result: Any
     warnings: Sequence[str]
     note: str | None
     tags: Sequence[str]
     etag: str
     has_signals: bool
     heights: Mapping[str, int]
-    diagnostics: Diagnostics
-    posterior: Sequence[PosteriorView]
-    model: ModelView | None
+    model: Any
 
 
 class JobView(JobOut):
@@ -145,27 +133,23 @@ def to_job_view(job: Job, unit: str, now: datetime, outcome: OutcomeOut | None =
     return JobView.from_source(document, lost_leases=job.lost_leases, max_attempts=job.max_attempts)
 
 
-def to_run_view(
-    run: Run, unit: str, heights: Mapping[str, int], model: ModelView | None = None
-) -> RunView:
-    """Build the view of a run; `heights` (px) are those of its plots. A row has no `model`."""
-    result = run.result or {}
+def to_run_view(stored: StoredRun, unit: str, heights: Mapping[str, int]) -> RunView:
+    """Build the view of a run; `heights` (px) are those of its plots."""
+    run, result = stored.run, stored.result
+    warnings = () if result is None else result.warnings
     return RunView.from_source(
         run,
         title=f"run {run.number + 1}",
         is_open=not run.state.is_terminal,
         cell_text=format_cell(run.cell, run.labels),
         unit=unit,
-        estimates=[to_estimate_view(parameter) for parameter in result.get("parameters", ())],
-        verdict=read_verdict(result) if result else None,
-        warnings=[rewrite_settings(note, write_choice) for note in result.get("warnings", ())],
+        result=result,
+        warnings=[rewrite_settings(note, write_choice) for note in warnings],
         tags=run.tags or (),
         etag=compute_etag(run),
         has_signals=run.state is JobState.SUCCEEDED,
         heights=heights,
-        diagnostics=to_diagnostics(result),
-        posterior=to_posterior_views(result),
-        model=model,
+        model=stored.model,
     )
 
 

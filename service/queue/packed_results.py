@@ -106,6 +106,14 @@ class PackedResults:
     signals_sha256: str | None = None
 
 
+def extract_estimates(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Extract the column `estimates` from a result document: values and standard errors."""
+    return {
+        parameter["name"]: {"value": parameter["value"], "stderr": parameter["stderr"]}
+        for parameter in result["parameters"]
+    }
+
+
 def pack_rows(rows: Sequence[Row], layout: RowLayout, dialect: Dialect) -> PackedRows:
     """Pack rows of plain values: JSON as text, numbers as `int` and `float`."""
     if dialect == "sqlite":

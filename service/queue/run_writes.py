@@ -21,6 +21,7 @@ from service.queue.packed_results import (
     ColumnKind,
     PackedResults,
     RowLayout,
+    extract_estimates,
 )
 from service.repositories.history import HistoryPoint, MigrantPoint, pack_history, pack_migrants
 from service.storage.columns import Document, UtcDateTime, to_json, utc_now
@@ -494,16 +495,7 @@ def _build_outcome_values(outcome: RunOutcome, now: Any, attempt: int) -> dict[s
     return {
         **values,
         "id": outcome.run_id,
-        "estimates": _extract_estimates(outcome.result),
+        "estimates": None if outcome.result is None else extract_estimates(outcome.result),
         "attempt": attempt,
         "finished_at": now,
-    }
-
-
-def _extract_estimates(result: Document | None) -> Document | None:
-    if result is None:
-        return None
-    return {
-        parameter["name"]: {"value": parameter["value"], "stderr": parameter["stderr"]}
-        for parameter in result["parameters"]
     }

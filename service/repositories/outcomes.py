@@ -1,7 +1,7 @@
 """What lists of jobs tell of results: one run stands for each job, and parts of its result."""
 
 from collections.abc import Collection, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from sqlalchemy import ColumnElement, Select, select
 from sqlalchemy.orm import Session
@@ -10,6 +10,8 @@ from service.core.job_fields import DATASETS_PATH
 from service.core.states import JobState
 from service.storage.columns import Document
 from service.storage.tables import Job, Run
+from sysid.core.value_documents import decode
+from sysid.uncertainty.estimates import Estimate
 
 
 class OutcomeRow(NamedTuple):
@@ -48,11 +50,13 @@ def match_outcomes(session: Session, jobs: Sequence[Job]) -> ColumnElement[bool]
     return (Run.job_id.in_(single) & (Run.number == 0)) | Run.id.in_(list(filter(None, best)))
 
 
-def read_parameters(session: Session, runs: Collection[str]) -> dict[str, list[Any]]:
-    """Read the entries ``parameters`` of the results of these runs, and nothing else of them."""
+def read_estimates(session: Session, runs: Collection[str]) -> dict[str, tuple[Estimate, ...]]:
+    """Read the estimates of these runs, and nothing else of their results."""
     parameters = Run.result.expression["parameters"]
     query = select(Run.id, parameters).where(Run.id.in_(runs), Run.deleted_at.is_(None))
-    return {run: entries or [] for run, entries in session.execute(query)}
+    return {
+        run: decode(tuple[Estimate, ...], entries or []) for run, entries in session.execute(query)
+    }
 
 
 def record_best_run(session: Session, job: Job) -> None:

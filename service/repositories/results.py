@@ -16,6 +16,8 @@ from service.storage.errors import InvalidCursor, RowNotFound
 from service.storage.sessions import find_project
 from service.storage.statements import RowPage
 from service.storage.tables import Job, Run
+from sysid.core.value_documents import decode
+from sysid.uncertainty.estimates import Estimate
 
 JOBS_AT_ONCE = 100
 MAX_JOBS = 2000
@@ -23,7 +25,7 @@ MAX_JOBS = 2000
 
 
 class ResultRow(NamedTuple):
-    """A successful run with the entries ``parameters`` of its result."""
+    """A successful run with its estimates."""
 
     job: Job
     run: str
@@ -32,7 +34,7 @@ class ResultRow(NamedTuple):
     cell: Document
     fit_estimation: float | None
     finished_at: datetime | None
-    parameters: Sequence[Document]
+    estimates: Sequence[Estimate]
 
 
 _COLUMNS = (
@@ -150,4 +152,5 @@ def _select_succeeded() -> Select[Any]:
 
 def _read_rows(session: Session, query: Select[Any], jobs: dict[str, Job]) -> Iterator[ResultRow]:
     for job, run, number, labels, cell, fit, ended, parameters in session.execute(query):
-        yield ResultRow(jobs[job], run, number, labels, cell, fit, ended, parameters or [])
+        estimates = decode(tuple[Estimate, ...], parameters or [])
+        yield ResultRow(jobs[job], run, number, labels, cell, fit, ended, estimates)

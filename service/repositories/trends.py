@@ -10,8 +10,16 @@ from service.repositories.runs import filter_job
 from service.storage.columns import Document
 from service.storage.sessions import find_project
 from service.storage.tables import Run
+from sysid.core.value_documents import decode, list_fields
+from sysid.residuals.onset_delay import OnsetDelay
+from sysid.results.result import Agreements, Result
+from sysid.uncertainty.estimates import Estimate
 
-RESULT_PARTS = ("parameters", "onset_delays", "agreement", "warnings", "correlation_times")
+_RESULT_PARTS = {
+    field.name: field.hint
+    for field in list_fields(Result)
+    if field.name in ("parameters", "onset_delays", "agreement", "warnings", "noise_model")
+}
 
 
 class TrendRow(NamedTuple):
@@ -23,11 +31,11 @@ class TrendRow(NamedTuple):
     labels: Document
     evaluations: int
     best_rms: float | None
-    parameters: list[Document]
-    onset_delays: list[Document]
-    agreement: Document
-    warnings: list[str]
-    correlation_times: Document
+    parameters: tuple[Estimate, ...]
+    onset_delays: tuple[OnsetDelay, ...]
+    agreement: Agreements
+    warnings: tuple[str, ...]
+    noise_model: str
 
 
 def read_trend_rows(
@@ -36,7 +44,7 @@ def read_trend_rows(
     """Read the successful runs of a job in the order of the sweep, at most `limit` of them."""
     names = TrendRow._fields
     columns = [
-        Run.result.expression[name] if name in RESULT_PARTS else getattr(Run, name)
+        Run.result.expression[name] if name in _RESULT_PARTS else getattr(Run, name)
         for name in names
     ]
     query = (
@@ -48,4 +56,12 @@ def read_trend_rows(
         .order_by(Run.number)
         .limit(limit)
     )
-    return [TrendRow(*row) for row in session.execute(query)]
+    return [
+        TrendRow(
+            *(
+                decode(_RESULT_PARTS[name], value) if name in _RESULT_PARTS else value
+                for name, value in zip(names, row, strict=True)
+            )
+        )
+        for row in session.execute(query)
+    ]

@@ -7,17 +7,15 @@ with as many simulations as there are parameters, twice.
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from math import nan
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.computed import ComputedValues
 from service.core.concurrency import simulation_limit
 from service.core.documents import to_finite
 from service.core.errors import Conflict, InvalidRequest, NotFound
-from service.jobs.stored_run import StoredRun, load_estimated_run, to_estimate
+from service.jobs.stored_run import StoredRun, load_estimated_run
 from service.runs.profiles import measure_work, read_estimate
 from service.runs.schemas import BandExperimentOut, BandOut, BandsOut
 from service.storage.errors import ObjectMissing, RowNotFound
@@ -27,7 +25,7 @@ from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
 from sysid.figures.theme import thin_indices
-from sysid.simulation.metrics import ChannelMetrics
+from sysid.results.result import Result
 
 if TYPE_CHECKING:
     from sysid.identification.fit_problems import FitRecords
@@ -95,6 +93,7 @@ def _compute_bands(
     from sysid.uncertainty.output_bands import ParameterSpread
 
     run_id, result = stored.run.id, stored.result
+    assert result is not None
     try:
         records = stored.read_fit_records(session, store)
         problem = stored.problem(session, store)
@@ -102,7 +101,7 @@ def _compute_bands(
         _check_work(run_id, problem)
         theta = read_estimate(problem, stored)
         noise_degrees = float(problem.n_scored - theta.size)
-        times = result.get("correlation_times") or {}
+        times = result.correlation_times
         with simulation_limit.acquire():
             whitening = make_whitening(problem, times) if any(times.values()) else None
             uncertainty = analyse_estimate(problem, theta, whitening=whitening).uncertainty
@@ -111,16 +110,16 @@ def _compute_bands(
             return compute_fit_bands(
                 stored.model,
                 list_whole_records(records.estimation, _list_later_parts(records)),
-                [to_estimate(document) for document in stored.estimates],
+                stored.estimates,
                 _read_ties(stored.body),
                 ParameterSpread(
                     problem.free_names,
                     uncertainty.covariance,
                     uncertainty.degrees,
                     noise_degrees,
-                    _read_samples(stored),
+                    _get_samples(result),
                 ),
-                estimate_noise(map(_to_metrics, result["agreement"]["estimation"]), noise_degrees),
+                estimate_noise(result.agreement.estimation, noise_degrees),
                 stored.body["prediction"],
             )
     except (SysidError, NotFound, InvalidRequest, RowNotFound, ObjectMissing) as error:
@@ -149,15 +148,9 @@ def _read_ties(body: Mapping[str, Any]) -> dict[str, str]:
     return {name: tie for name, tie in ties.items() if tie is not None}
 
 
-def _read_samples(stored: StoredRun) -> FloatArray | None:
-    samples = (stored.result.get("posterior") or {}).get("samples")
-    return np.array(samples, dtype=np.float64) if samples else None
-
-
-def _to_metrics(document: Mapping[str, Any]) -> ChannelMetrics:
-    names = ("experiment", "output", "unit", "samples", "rms")
-    experiment, output, unit, samples, rms = (document[name] for name in names)
-    return ChannelMetrics(experiment, output, unit, samples, rms, fit_percent=nan)
+def _get_samples(result: Result) -> FloatArray | None:
+    posterior = result.posterior
+    return posterior.samples if posterior is not None and posterior.samples.size else None
 
 
 def _to_band_out(bands: "OutputBands", max_points: int) -> BandOut:

@@ -3,12 +3,13 @@
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import combinations
+from math import isfinite
 from typing import Any
 
 from sqlalchemy.orm import Session
 
+from service.core.documents import to_finite
 from service.core.errors import FieldError, InvalidRequest
-from service.jobs.results import read_noise_model
 from service.jobs.stored_run import StoredRun, load_run
 from service.runs.schemas import (
     ComparedParameterOut,
@@ -18,8 +19,9 @@ from service.runs.schemas import (
 )
 from service.storage.errors import RowNotFound
 from sysid.core.text import plain_estimate, plain_unit
-
-ResultDocument = Mapping[str, Any]
+from sysid.core.value_documents import encode
+from sysid.results.result import Result
+from sysid.uncertainty.estimates import Estimate
 
 _DATA_DIFFERENCES = {
     "datasets": "other datasets",
@@ -72,7 +74,7 @@ def load_compared_runs(
         _check_same_data(candidates)
     elif not have_same_data(candidates):
         return candidates
-    return sorted(candidates, key=lambda stored: _rank_rms(stored.result.get("rms")))
+    return sorted(candidates, key=lambda stored: _rank_rms(_get_result(stored).rms))
 
 
 def _read_candidates(session: Session, runs: Sequence[str]) -> list[StoredRun]:
@@ -159,9 +161,14 @@ def build_titles(ordered: Sequence[StoredRun]) -> dict[str, str]:
     return titles
 
 
+def _get_result(stored: StoredRun) -> Result:
+    assert stored.result is not None  # only runs with a result are compared
+    return stored.result
+
+
 def _to_compared_run(stored: StoredRun, title: str) -> ComparedRunOut:
-    result = stored.result
-    criteria, tests, fit = result["criteria"], result["residual_tests"], result["fit_percent"]
+    result = _get_result(stored)
+    criteria, tests, fit = result.criteria, result.residual_tests, result.fit_percent
     return ComparedRunOut(
         run=stored.run.id,
         job=stored.job.id,
@@ -169,17 +176,17 @@ def _to_compared_run(stored: StoredRun, title: str) -> ComparedRunOut:
         model=stored.model.name,
         title=title,
         cell=stored.run.cell,
-        parameters=criteria["parameters"],
-        samples=criteria["samples"],
-        rms=result["rms"],
-        rms_validation=result["rms_validation"],
-        fit_estimation=fit["estimation"],
-        fit_validation=fit["validation"],
-        aic=criteria["aic"],
-        bic=criteria["bic"],
-        residuals_passed=tests.get("passed"),
-        residuals_data=tests.get("data"),
-        evaluations=result["evaluations"],
+        parameters=criteria.parameters,
+        samples=criteria.samples,
+        rms=to_finite(result.rms),
+        rms_validation=to_finite(result.rms_validation),
+        fit_estimation=to_finite(fit.estimation),
+        fit_validation=to_finite(fit.validation),
+        aic=to_finite(criteria.aic),
+        bic=to_finite(criteria.bic),
+        residuals_passed=tests.passed,
+        residuals_data=tests.data,
+        evaluations=result.evaluations,
     )
 
 
@@ -187,10 +194,10 @@ def _compare_parameters(
     ordered: Sequence[StoredRun], titles: Mapping[str, str]
 ) -> Iterator[ComparedParameterOut]:
     """Compare parameters that have the same name and unit in at least two runs."""
-    entries: dict[tuple[str, str], list[tuple[StoredRun, ResultDocument]]] = {}
+    entries: dict[tuple[str, str], list[tuple[StoredRun, Estimate]]] = {}
     for stored in ordered:
-        for estimate in stored.result["parameters"]:
-            entries.setdefault((estimate["name"], estimate["unit"]), []).append((stored, estimate))
+        for estimate in stored.estimates:
+            entries.setdefault((estimate.name, estimate.unit), []).append((stored, estimate))
     for (name, unit), values in entries.items():
         if len(values) < 2:
             continue
@@ -203,40 +210,43 @@ def _compare_parameters(
                 [(titles[values[i][0].run.id], values[i][1]) for i in pair],
                 same_model=len({stored.model.name for stored, _ in values}) == 1,
             )
-        n_intervals = sum(_has_ends(estimate["interval95"]) for _, estimate in values)
+        n_intervals = sum(_has_ends(estimate.interval95) for _, estimate in values)
         yield ComparedParameterOut(
             name=name,
             unit=unit,
             differs=None if n_intervals < 2 else pair is not None,
             note=note,
             values=[
-                ComparedValueOut.model_validate({**e, "run": stored.run.id}) for stored, e in values
+                ComparedValueOut.model_validate({**encode(e), "run": stored.run.id})
+                for stored, e in values
             ],
         )
 
 
-def find_furthest_pair(estimates: Sequence[ResultDocument]) -> tuple[int, int] | None:
+def find_furthest_pair(estimates: Sequence[Estimate]) -> tuple[int, int] | None:
     """Find the two estimates whose 95 % intervals are furthest apart; None if all overlap."""
-    with_interval = [i for i, estimate in enumerate(estimates) if _has_ends(estimate["interval95"])]
+    intervals = {
+        i: estimate.interval95
+        for i, estimate in enumerate(estimates)
+        if estimate.interval95 is not None and _has_ends(estimate.interval95)
+    }
     gaps = {
-        (i, j): max(estimates[i]["interval95"][0], estimates[j]["interval95"][0])
-        - min(estimates[i]["interval95"][1], estimates[j]["interval95"][1])
-        for i, j in combinations(with_interval, 2)
+        (i, j): max(intervals[i][0], intervals[j][0]) - min(intervals[i][1], intervals[j][1])
+        for i, j in combinations(intervals, 2)
     }
     widest = max(gaps, key=lambda pair: gaps[pair], default=None)
     return widest if widest is not None and gaps[widest] > 0 else None
 
 
-def _has_ends(interval: Sequence[float | None] | None) -> bool:
-    return interval is not None and all(end is not None for end in interval)
+def _has_ends(interval: tuple[float, float] | None) -> bool:
+    return interval is not None and all(map(isfinite, interval))
 
 
 def _describe_difference(
-    name: str, unit: str, pair: Sequence[tuple[str, ResultDocument]], *, same_model: bool
+    name: str, unit: str, pair: Sequence[tuple[str, Estimate]], *, same_model: bool
 ) -> str:
     texts = [
-        (plain_estimate(one["value"], one["stderr"], status=one["status"]), title)
-        for title, one in pair
+        (plain_estimate(one.value, one.stderr, status=one.status), title) for title, one in pair
     ]
     values = ", ".join(f"{text}{plain_unit(unit)} with {title}" for text, title in texts)
     return f"{name} depends on the {'run' if same_model else 'model'}: {values}"
@@ -246,9 +256,9 @@ def _find_common_unit(ordered: Sequence[StoredRun]) -> str:
     """Find the common unit of the RMS. Weighted outputs have none."""
     units = set()
     for stored in ordered:
-        agreement = stored.result["agreement"]["estimation"]
-        outputs = {entry["output"] for entry in agreement}
-        units.add(agreement[0]["unit"] if len(outputs) == 1 else "1")
+        agreement = _get_result(stored).agreement.estimation
+        outputs = {entry.output for entry in agreement}
+        units.add(agreement[0].unit if len(outputs) == 1 else "1")
     return units.pop() if len(units) == 1 else "1"
 
 
@@ -272,17 +282,17 @@ def _list_notes(ordered: Sequence[StoredRun]) -> Iterator[str]:
             "Their RMS, fits and criteria do not compare"
         )
     losses = (
-        {**stored.body["loss"], "noise_model": read_noise_model(stored.result)}
+        {**stored.body["loss"], "noise_model": _get_result(stored).noise_model}
         for stored in ordered
     )
     if len({repr(sorted(loss.items())) for loss in losses}) > 1:
         yield "the runs were fitted with different losses. Each loss favours its own measure"
-    if len({stored.result["criteria"]["samples"] for stored in ordered}) > 1:
+    if len({_get_result(stored).criteria.samples for stored in ordered}) > 1:
         yield (
             "the runs scored different numbers of samples, so AIC and BIC do not compare. "
             "Recursions do not score their initial samples. Give all runs the same skip"
         )
 
 
-def _rank_rms(value: float | None) -> float:
-    return float("inf") if value is None else value
+def _rank_rms(value: float) -> float:
+    return value if isfinite(value) else float("inf")

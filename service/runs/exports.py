@@ -16,8 +16,10 @@ from service.storage.tables import Dataset
 from sysid.control.linear_form import Covariance, IdentifiedModel, IdentifiedValue, NotLinear
 from sysid.core.errors import InvalidSettings
 from sysid.core.text import find_shown_error
-from sysid.data.records import Hold
+from sysid.core.value_documents import encode, list_fields
 from sysid.export.export import ExportFormat, write_export
+from sysid.results.result import Result
+from sysid.uncertainty.estimates import Estimate
 
 JobBody = Mapping[str, Any]
 
@@ -30,11 +32,6 @@ _MEDIA_TYPES: Mapping[ExportFormat, tuple[str, str]] = {
 
 TEXT_TYPES = sorted({kind for kind, _ in _MEDIA_TYPES.values()} - {"application/json"})
 """Media types of the formats that are source code."""
-
-ESTIMATE_COLUMNS = (
-    *("parameter", "value", "stderr", "interval95_low", "interval95_high"),
-    *("unit", "status", "lower_bound", "upper_bound"),
-)
 
 
 class ExportFile(NamedTuple):
@@ -87,26 +84,46 @@ def write_estimates(session: Session, run_id: str) -> str:
         If the run has no estimates.
     """
     stored = load_estimated_run(session, run_id, "export")
-    return write_csv([ESTIMATE_COLUMNS, *map(_list_fields, stored.estimates)])
+    return write_csv([_ESTIMATE_COLUMNS, *map(_list_cells, stored.estimates)])
 
 
-def _list_fields(estimate: Mapping[str, Any]) -> tuple[object, ...]:
-    stderr = find_shown_error(estimate["stderr"], estimate["status"])
-    low, high = (None if stderr is None else estimate["interval95"]) or (None, None)
-    names = "unit", "status", "lower", "upper"
-    return estimate["name"], estimate["value"], stderr, low, high, *map(estimate.get, names)
+def _list_columns() -> dict[str, str]:
+    """List the columns of the estimates, each with its field: those of old first, then all others.
+
+    The interval is two columns.
+    """
+    first = {
+        **{"parameter": "name", "value": "value", "stderr": "stderr"},
+        **{"interval95_low": "interval95", "interval95_high": "interval95", "unit": "unit"},
+        **{"status": "status", "lower_bound": "lower", "upper_bound": "upper"},
+    }
+    others = [field.name for field in list_fields(Estimate)]
+    return first | {name: name for name in others if name not in first.values()}
+
+
+def _list_cells(estimate: Estimate) -> Iterator[object]:
+    """List the cells of an estimate; without an error that is shown, it has no interval."""
+    shown = {**encode(estimate), "stderr": find_shown_error(estimate.stderr, estimate.status)}
+    low, high = (None if shown["stderr"] is None else shown["interval95"]) or (None, None)
+    ends = {"interval95_low": low, "interval95_high": high}
+    for column, field in _ESTIMATE_COLUMNS.items():
+        yield ends[column] if column in ends else shown[field]
+
+
+_ESTIMATE_COLUMNS = _list_columns()
 
 
 def _build_identified(session: Session, stored: StoredRun) -> IdentifiedModel:
-    rows = _read_datasets(session, stored.body)
+    rows, result = _read_datasets(session, stored.body), stored.result
+    assert result is not None  # only an identified model is exported
     values = tuple(_read_values(stored))
     return IdentifiedModel(
         stored.model,
         values,
-        _compute_covariance(stored.result, values),
+        _compute_covariance(result, values),
         _find_sample_time(stored, rows),
-        {signal.name: _find_hold(signal.name, stored) for signal in stored.model.inputs},
-        stored.result["version"],
+        {signal.name: result.holds[signal.name] for signal in stored.model.inputs},
+        stored.document["version"],
         _describe_provenance(stored, rows),
         dict(_find_units(stored, rows)),
     )
@@ -124,25 +141,20 @@ def _read_datasets(session: Session, body: JobBody) -> list[Dataset]:
 
 
 def _read_values(stored: StoredRun) -> Iterator[IdentifiedValue]:
-    for estimate in stored.estimates:
-        yield IdentifiedValue(
-            estimate["name"],
-            estimate["value"],
-            estimate["unit"],
-            estimate["stderr"],
-            estimate["status"],
-        )
+    for one in stored.estimates:
+        yield IdentifiedValue(one.name, one.value, one.unit, one.stderr, one.status)
 
 
-def _compute_covariance(result: JobBody, values: tuple[IdentifiedValue, ...]) -> Covariance | None:
+def _compute_covariance(
+    result: Result | None, values: tuple[IdentifiedValue, ...]
+) -> Covariance | None:
     """Compute the covariance from correlations and standard errors; ``nan`` if one is missing."""
-    correlation = result.get("correlation")
-    if correlation is None:
+    if result is None or result.correlation is None:
         return None
+    correlation = result.correlation
     errors = {value.name: np.nan if value.stderr is None else value.stderr for value in values}
-    deviations = np.array([errors[name] for name in correlation["names"]], dtype=np.float64)
-    matrix = np.array(correlation["matrix"], dtype=np.float64)
-    return Covariance(tuple(correlation["names"]), matrix * np.outer(deviations, deviations))
+    deviations = np.array([errors[name] for name in correlation.names], dtype=np.float64)
+    return Covariance(correlation.names, correlation.matrix * np.outer(deviations, deviations))
 
 
 def _find_channels(
@@ -174,14 +186,6 @@ def _find_units(stored: StoredRun, rows: list[Dataset]) -> Iterator[tuple[str, s
             yield signal, units.pop()
 
 
-def _find_hold(name: str, stored: StoredRun) -> Hold:
-    """Find how the run read an input, in the first experiment if they differ."""
-    holds: Iterator[Hold] = (
-        item["chosen"] for item in stored.result["input_hold"] if item["input"] == name
-    )
-    return next(holds)
-
-
 def _describe_provenance(stored: StoredRun, rows: list[Dataset]) -> dict[str, Any]:
     run, job = stored.run, stored.job
     descriptions = {row.id: {"id": row.id, "name": row.name, "sha256": row.sha256} for row in rows}
@@ -193,8 +197,8 @@ def _describe_provenance(stored: StoredRun, rows: list[Dataset]) -> dict[str, An
         "method": run.method,
         "seed": run.seed,
         "spec_hash": run.spec_hash,
-        "fingerprint": stored.result["fingerprint"],
+        "fingerprint": stored.document["fingerprint"],
         "rms": run.best_rms,
-        "fit_percent": stored.result["fit_percent"],
+        "fit_percent": stored.document["fit_percent"],
         "datasets": [descriptions.get(name, {"id": name}) for name in stored.body["datasets"]],
     }

@@ -30,6 +30,7 @@ from sysid.data.records import Channel, Record
 from sysid.models.model import build_initial_parameters, name_initial_state
 from sysid.models.units import SignalUnits
 from sysid.simulation.metrics import Metrics
+from sysid.uncertainty.estimates import Estimate
 
 if TYPE_CHECKING:
     from sysid.simulation.problem import Problem
@@ -179,7 +180,7 @@ def _build_problem(stored: StoredRun, records: tuple[Record, ...], skip: int) ->
     model, request = stored.model, stored.body
     own_names = {parameter.name for parameter in model.parameters}
     values = {
-        estimate["name"]: estimate for estimate in stored.estimates if estimate["name"] in own_names
+        estimate.name: estimate for estimate in stored.estimates if estimate.name in own_names
     }
     starts = {parameter.name for parameter in build_initial_parameters(model, len(records))}
     changes = {name: f for name, f in request["parameters"].items() if name in starts}
@@ -196,10 +197,10 @@ def _build_problem(stored: StoredRun, records: tuple[Record, ...], skip: int) ->
         raise InvalidRequest.from_fault("/dataset", str(error)) from None
 
 
-def _fix_estimate(estimate: Mapping[str, Any]) -> dict[str, Any]:
+def _fix_estimate(estimate: Estimate) -> dict[str, Any]:
     """Fix an estimate. That of a tied parameter may lie outside its bounds."""
-    value = float(estimate["value"])
-    bounds = [float(estimate[k]) for k in ("lower", "upper") if estimate.get(k) is not None]
+    value = estimate.value
+    bounds = [bound for bound in (estimate.lower, estimate.upper) if isfinite(bound)]
     return {
         "fixed": value,
         "scale": "linear",

@@ -118,5 +118,5 @@ def measure_work(problem: "Problem") -> int:
 
 def read_estimate(problem: "Problem", stored: StoredRun) -> FloatArray:
     """Read the estimates (D,) of a run's free parameters."""
-    values = {estimate["name"]: estimate["value"] for estimate in stored.estimates}
+    values = {estimate.name: estimate.value for estimate in stored.estimates}
     return np.array([values[name] for name in problem.free_names])

@@ -15,12 +15,12 @@ from service.core.errors import NotFound, ServiceError
 from service.formats.mcap import FittedOutput
 from service.jobs.stored_run import StoredRun, load_run
 from service.runs.fitted import load_fitted_signals
-from service.runs.result import to_test_document
 from service.runs.schemas import CorrelationOut, ResidualsOut
 from service.storage.errors import StorageError
 from service.storage.objects import ObjectStore
 from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
+from sysid.core.value_documents import encode
 from sysid.data.records import Channel
 from sysid.residuals.past_outputs import count_past_output_coefficients
 from sysid.residuals.residual_tests import (
@@ -81,7 +81,7 @@ def analyse_residuals(
     validation = [fit for fit in fits if fit.role == "validation"]
     inputs, missing = _read_inputs(session, store, stored, bool(validation))
     counts = {} if validation else _count_past_coefficients(session, stored)
-    times = stored.result.get("correlation_times") or {}
+    times = {} if stored.result is None else stored.result.correlation_times
     correlations = compute_correlations(
         [
             series._replace(coefficients=counts.get(series.output, 0))
@@ -101,12 +101,8 @@ def _count_past_coefficients(session: Session, stored: StoredRun) -> dict[str, i
 
 
 def _to_correlation_out(function: CorrelationFunction) -> CorrelationOut:
-    functions = {
-        name: getattr(function, name).tolist() for name in ("lags", "values", "band95", "band99")
-    }
-    return CorrelationOut.model_validate(
-        {**to_test_document(function.test), "period": function.period, **functions}
-    )
+    document = encode(function)
+    return CorrelationOut.model_validate({**document.pop("test"), **document})
 
 
 def _build_series(

@@ -88,7 +88,7 @@ def _read_datasets(session: Session, stored: StoredRun) -> dict[str, Dataset]:
 
 def _describe_run(stored: StoredRun, datasets: Mapping[str, Dataset]) -> dict[str, str]:
     """Build the content of the metadata record: texts, and JSON where it has parts."""
-    run, job, result = stored.run, stored.job, stored.result
+    run, job, result = stored.run, stored.job, stored.document
     fields: dict[str, Any] = {
         "run": run.id,
         "job": job.id,
@@ -98,7 +98,7 @@ def _describe_run(stored: StoredRun, datasets: Mapping[str, Dataset]) -> dict[st
         "model": stored.model.document,
         "parameters": [
             {name: entry[name] for name in ("name", "value", "unit", "stderr", "status")}
-            for entry in stored.estimates
+            for entry in result.get("parameters", ())
         ],
         "datasets": [
             {

@@ -10,7 +10,6 @@ from sqlalchemy.orm import Session
 from service.core.errors import InvalidRequest
 from service.core.json_pointer import build_run_body
 from service.core.states import JobState
-from service.jobs.results import is_free, read_verdict
 from service.jobs.stored_run import StoredRun, load_run
 from service.repositories.jobs import JobRepository
 from service.repositories.lineage import WrittenProgress, read_written_progress
@@ -23,8 +22,11 @@ from service.runs.schemas import (
     RunOut,
     RunPage,
 )
+from service.storage.columns import Document
 from service.storage.tables import Job, Run
+from sysid.core.value_documents import encode
 from sysid.models.parameters import Parameter
+from sysid.uncertainty.estimates import Estimate
 
 MAX_OPEN_PROGRESS = 0.99  # of an unfinished run: refinement is still to come
 
@@ -58,7 +60,7 @@ def list_runs(
         descending=choice.descending,
     )
     progress = read_written_progress(session, [run.id for run in page.items if run.result is None])
-    items = [_leave_out_samples(to_run_out(run, job, progress.get(run.id))) for run in page.items]
+    items = [to_run_out(run, job, progress.get(run.id), with_samples=False) for run in page.items]
     return RunPage(items=items, next=page.next)
 
 
@@ -74,8 +76,13 @@ def get_run(session: Session, run_id: str) -> RunOut:
     return answer.model_copy(update={"parameters": _list_best_parameters(session, stored)})
 
 
-def to_run_out(run: Run, job: Job, written: WrittenProgress | None = None) -> RunOut:
-    """Build the answer for a run: its result document, or its progress."""
+def to_run_out(
+    run: Run, job: Job, written: WrittenProgress | None = None, *, with_samples: bool = True
+) -> RunOut:
+    """Build the answer for a run: its result document, or its progress.
+
+    A list of runs is without the samples of the posterior, which it would repeat for each.
+    """
     progress: dict[str, Any] = {
         "rms": run.best_rms,
         "evaluations": run.evaluations,
@@ -87,11 +94,11 @@ def to_run_out(run: Run, job: Job, written: WrittenProgress | None = None) -> Ru
             "evaluations": written.evaluations,
             "generations": written.generation,
         }
+    result = run.result or {}
     return RunOut.model_validate(
         {
             **progress,
-            **(run.result or {}),
-            "verdict": None if run.result is None else read_verdict(run.result),
+            **(result if with_samples else _leave_out_samples(result)),
             "id": run.id,
             "job": run.job_id,
             "number": run.number,
@@ -112,12 +119,11 @@ def to_run_out(run: Run, job: Job, written: WrittenProgress | None = None) -> Ru
     )
 
 
-def _leave_out_samples(run: RunOut) -> RunOut:
-    """Leave out the samples of the posterior, which a list of runs would repeat for each."""
-    if not run.posterior:
-        return run
-    kept = {name: value for name, value in run.posterior.items() if name != "samples"}
-    return run.model_copy(update={"posterior": kept})
+def _leave_out_samples(result: Document) -> Document:
+    if not result.get("posterior"):
+        return result
+    posterior = {name: value for name, value in result["posterior"].items() if name != "samples"}
+    return {**result, "posterior": posterior}
 
 
 def get_history(session: Session, run_id: str) -> HistoryOut:
@@ -145,17 +151,19 @@ def _list_best_parameters(session: Session, stored: StoredRun) -> list[dict[str,
     best = min(points, key=lambda point: point.rms)
     reason = f"the run was {stored.run.state.value} before its standard errors were computed"
     return [
-        {
-            "name": parameter.name,
-            "unit": parameter.unit,
-            "value": value,
-            "lower": parameter.lower,
-            "upper": parameter.upper,
-            "stderr": None,
-            "interval95": None,
-            "status": "unfinished",
-            "reason": reason,
-        }
+        encode(
+            Estimate(
+                parameter.name,
+                parameter.unit,
+                value,
+                parameter.lower,
+                parameter.upper,
+                None,
+                None,
+                "unfinished",
+                reason,
+            )
+        )
         for parameter, value in zip(
             _list_free_parameters(session, stored), best.parameters, strict=False
         )
@@ -164,7 +172,7 @@ def _list_best_parameters(session: Session, stored: StoredRun) -> list[dict[str,
 
 def _list_free_names(session: Session, stored: StoredRun) -> list[str]:
     if stored.run.result is not None:
-        return [estimate["name"] for estimate in stored.estimates if is_free(estimate)]
+        return [estimate.name for estimate in stored.estimates if estimate.is_free]
     return [parameter.name for parameter in _list_free_parameters(session, stored)]
 
 

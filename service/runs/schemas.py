@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from service.core.states import StateName
+from service.core.value_schemas import describe_value, extend_by, extend_later_by
 from service.core.wire import (
     Answer,
     Body,
@@ -21,31 +22,19 @@ from service.core.wire import (
 )
 from service.datasets.schemas import SeriesOut
 from service.models.schemas import ModelDocumentOut
-from service.runs.result_schemas import (
-    AgreementsOut,
-    CriteriaOut,
-    EstimateOut,
-    FitOut,
-    IdentifiabilityOut,
-    InputHoldOut,
-    IslandOut,
-    KnownBeforeOut,
-    MatrixOut,
-    OnsetDelayOut,
-    OrderComparisonOut,
-    PosteriorOut,
-    ResidualTestOut,
-    ResidualVerdictOut,
-    SearchOut,
-    SelectedTermOut,
-    VerdictOut,
-)
+from sysid.control.linear_form import Covariance, IdentifiedValue
+from sysid.residuals.residual_tests import ResidualTest
+from sysid.results.result import Result
+from sysid.simulation.metrics import ChannelMetrics
+from sysid.uncertainty.estimates import Estimate
 
 
+@extend_later_by(Result, parameters=[], warnings=[])
 class RunOut(Answer):
     """One identification: its cell of the sweep, progress, and result.
 
-    What belongs to the result is null until it exists.
+    What belongs to the result is null until it exists. Its fields are those of
+    `sysid.results.result.Result`.
     """
 
     id: str = Field(description="identifier, `run_…`")
@@ -85,88 +74,9 @@ class RunOut(Answer):
     evaluations: int = Field(default=0, description="simulations so far")
     generations: int = Field(default=0, description="generations so far")
     seconds: float | None = Field(default=None, description="compute time, s")
-    valid: bool | None = Field(
-        default=None, description="whether the model can be simulated with the estimates"
-    )
-    parameters: Annotated[Any, DescribedBy(list[EstimateOut])] = Field(
-        default=[], description="estimates with their errors"
-    )
-    rms_validation: float | None = Field(
-        default=None, description="RMS error on the validation data, in the unit of `rms`"
-    )
     rms_noise_free: float | None = Field(
         default=None,
         description="RMS error against the record without added noise, in the unit of `rms`",
-    )
-    fit_percent: Annotated[Any, DescribedBy(FitOut | None)] = Field(
-        default=None, description="fit to both kinds of data"
-    )
-    agreement: Annotated[Any, DescribedBy(AgreementsOut | None)] = Field(
-        default=None, description="agreement of each output of each record"
-    )
-    islands: Annotated[Any, DescribedBy(list[IslandOut] | None)] = Field(
-        default=None, description="champion of each island"
-    )
-    identifiability: Annotated[Any, DescribedBy(IdentifiabilityOut | None)] = Field(
-        default=None, description="what the data can tell apart"
-    )
-    criteria: Annotated[Any, DescribedBy(CriteriaOut | None)] = Field(
-        default=None, description="information criteria"
-    )
-    correlation: Annotated[Any, DescribedBy(MatrixOut | None)] = Field(
-        default=None, description="correlation of the estimates; null without errors"
-    )
-    noise_sd: float | None = Field(
-        default=None,
-        description="standard deviation of the weighted residuals, in the unit of `rms`",
-    )
-    noise_colour: str | None = Field(
-        default=None, description="colour of the residuals that the errors assume"
-    )
-    noise_model: str | None = Field(default=None, description="noise model of the estimates")
-    correlation_times: dict[str, float] | None = Field(
-        default=None, description="correlation time of each output's noise, s"
-    )
-    noise_deviations: list[list[float]] | None = Field(
-        default=None,
-        description="relative deviation of the noise by experiment and output, by which residuals "
-        "were divided; null if all count alike or weights were given",
-    )
-    residual_tests: Annotated[Any, DescribedBy(ResidualVerdictOut | None)] = Field(
-        default=None, description="tests of the residuals; empty if none were made"
-    )
-    onset_delays: Annotated[Any, DescribedBy(list[OnsetDelayOut] | None)] = Field(
-        default=None, description="delay between the start of an input's and an output's change"
-    )
-    data_bounds: list[str] | None = Field(
-        default=None, description="parameters whose bounds follow the data"
-    )
-    input_hold: Annotated[Any, DescribedBy(list[InputHoldOut] | None)] = Field(
-        default=None, description="how each input is read between its samples"
-    )
-    known_before: Annotated[Any, DescribedBy(KnownBeforeOut | None)] = Field(
-        default=None, description="recorded time before the start of each record"
-    )
-    search: Annotated[Any, DescribedBy(SearchOut | None)] = Field(
-        default=None, description="whether the search settled, and the minima that were found"
-    )
-    posterior: Annotated[Any, DescribedBy(PosteriorOut | None)] = Field(
-        default=None, description="samples of the posterior; null if not requested"
-    )
-    order_comparison: Annotated[Any, DescribedBy(OrderComparisonOut | None)] = Field(
-        default=None,
-        description="one order less and one more; null if not compared, or no process with delay",
-    )
-    delays: list[str] | None = Field(
-        default=None, description="free parameters that time lags depend on"
-    )
-    verdict: Annotated[Any, DescribedBy(VerdictOut | None)] = Field(
-        default=None, description="whether the estimates can be relied on, with the reasons"
-    )
-    warnings: list[str] = Field(default=[], description="what limits the result")
-    substeps: int | None = Field(default=None, description="integration steps in one grid step")
-    selection: Annotated[Any, DescribedBy(list[SelectedTermOut] | None)] = Field(
-        default=None, description="selected terms; empty if none were to be selected"
     )
 
 
@@ -242,7 +152,8 @@ class BandsOut(Answer):
     experiments: list[BandExperimentOut] = Field(description="records of the run")
 
 
-class CorrelationOut(ResidualTestOut):
+@extend_by(ResidualTest)
+class CorrelationOut(Answer):
     """Correlation function of residuals with its bands, and its test.
 
     `input` is null for the autocorrelation. `lags` are in periods of `period` seconds. If `period`
@@ -340,16 +251,6 @@ class ProfilesOut(RunProfilesOut):
     figure: FigureOut = Field(description="figure of the profiles, as Plotly JSON")
 
 
-class ExportedValueOut(Answer):
-    """Value of a parameter or initial state."""
-
-    name: str = Field(description="name of the parameter, or of the initial state as ``x(0)``")
-    value: float = Field(description="value, in `unit`")
-    unit: str = Field(description="unit of value and standard error")
-    stderr: float | None = Field(description="standard error, in `unit`; null without one")
-    status: str = Field(description="status of the estimate")
-
-
 class ExportedDataOut(Answer):
     """Sampling of the data."""
 
@@ -363,8 +264,12 @@ class ExportedModelOut(Answer):
     format: str = Field(description="name and version of this format")
     lagid: str | None = Field(description="version of lagid that wrote it")
     model: Annotated[Any, DescribedBy(ModelDocumentOut)] = Field(description="model document")
-    values: list[ExportedValueOut] = Field(description="parameters and initial states")
-    covariance: MatrixOut | None = Field(description="covariance of the free parameters")
+    values: Annotated[Any, DescribedBy(list[describe_value(IdentifiedValue)])] = Field(
+        description="parameters and initial states"
+    )
+    covariance: Annotated[Any, DescribedBy(describe_value(Covariance) | None)] = Field(
+        description="covariance of the free parameters"
+    )
     data: ExportedDataOut = Field(description="sampling of the data")
     provenance: dict[str, Any] = Field(description="run, job and data of the values")
 
@@ -399,18 +304,11 @@ class ComparedRunOut(Answer):
     evaluations: int = Field(description="simulations of the search")
 
 
+@extend_by(Estimate)
 class ComparedValueOut(Answer):
-    """Estimate of a parameter by one run; `stderr` and `interval95` are null without errors."""
+    """Estimate of a parameter by one run."""
 
     run: str = Field(description="identifier of the run")
-    value: float = Field(description="estimate, in the parameter's unit")
-    stderr: float | None = Field(
-        description="standard error, in the parameter's unit; null without one"
-    )
-    interval95: list[float] | None = Field(
-        description="95 % interval, in the parameter's unit; null without errors"
-    )
-    status: str = Field(description="status of the estimate")
 
 
 class ComparedParameterOut(Answer):
@@ -459,15 +357,11 @@ class FreeRunIn(Body):
     )
 
 
+@extend_by(ChannelMetrics)
 class AgreementOut(Answer):
     """Fit of one output of one experiment (counted from 1); null if the output does not vary."""
 
     experiment: int = Field(description="record, from 1")
-    output: str = Field(description="output of the model")
-    unit: str = Field(description="unit of the RMS")
-    samples: int = Field(description="scored samples")
-    rms: float = Field(description="RMS error, in `unit`")
-    fit_percent: Finite = Field(description="fit, %; null if the output does not vary")
 
 
 class FreeRunOut(Answer):

@@ -10,6 +10,8 @@ import numpy as np
 from service.storage.tables import Run
 from service.trends.points import TrendQuantity, read_onset_estimates
 from service.trends.schemas import DriftOut
+from sysid.core.value_documents import decode
+from sysid.residuals.onset_delay import OnsetDelay
 from sysid.trends.trend import Drift, Trend, TrendEstimate, compute_drift, compute_law_drifts
 
 
@@ -82,7 +84,8 @@ def _read_estimate(run: Run, name: str) -> TrendEstimate | None:
     """Read the estimate of a parameter or an onset delay, with its standard error."""
     estimate: Any = (run.estimates or {}).get(name)
     if estimate is None:
-        return read_onset_estimates((run.result or {}).get("onset_delays") or []).get(name)
+        onsets = decode(tuple[OnsetDelay, ...], (run.result or {}).get("onset_delays", []))
+        return read_onset_estimates(onsets).get(name)
     return TrendEstimate(estimate["value"], estimate["stderr"]) if estimate["stderr"] else None
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from service.jobs.results import read_noise_model
 from service.repositories.trends import TrendRow
 from service.trends.points import TrendQuantity
 from sysid.core.units import format_unit
@@ -33,8 +32,7 @@ def describe_noise_models(
         Noise model of the reference run; empty if there is none.
     """
     models_by_x = {
-        x_value: {read_noise_model(row._asdict()) for row in rows}
-        for x_value, rows in rows_by_label.items()
+        x_value: {row.noise_model for row in rows} for x_value, rows in rows_by_label.items()
     }
     if len({reference, *(model for models in models_by_x.values() for model in models)} - {""}) < 2:
         return ""

@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import inf
+from math import inf, isfinite
 from typing import Any, Literal
 
-from service.jobs.results import is_free
 from service.repositories.trends import TrendRow
 from service.trends.schemas import BatchLabelOut, SpanOut
+from sysid.residuals.onset_delay import OnsetDelay
 from sysid.trends.trend import TrendEstimate, pool_estimates
 
 DatasetChannels = Mapping[str, Mapping[str, Any]]
@@ -63,10 +63,10 @@ class _QuantityEstimates:
     upper: float = -inf
     entries: dict[float, list[_RunEstimate]] = field(default_factory=dict)
 
-    def widen_bounds(self, lower: float | None, upper: float | None) -> None:
-        """Include the bounds of a run; None means that there is none."""
-        self.lower = min(self.lower, -inf if lower is None else lower)
-        self.upper = max(self.upper, inf if upper is None else upper)
+    def widen_bounds(self, lower: float, upper: float) -> None:
+        """Include the bounds of a run; one that is not finite means that there is none."""
+        self.lower = min(self.lower, lower if isfinite(lower) else -inf)
+        self.upper = max(self.upper, upper if isfinite(upper) else inf)
 
 
 def group_by_label(rows: Sequence[TrendRow], x: str) -> dict[float, list[TrendRow]]:
@@ -95,16 +95,14 @@ def build_quantities(
     for x, rows in rows_by_label.items():
         for row in rows:
             for estimate in row.parameters:
-                if estimate["name"] in names or (not names and is_free(estimate)):
-                    entry = _RunEstimate(
-                        row.id, estimate["value"], estimate["stderr"], estimate["status"]
-                    )
+                if estimate.name in names or (not names and estimate.is_free):
+                    entry = _RunEstimate(row.id, estimate.value, estimate.stderr, estimate.status)
                     column = _add_estimate(
-                        columns, estimate["name"], estimate["unit"], "parameter", x, entry
+                        columns, estimate.name, estimate.unit, "parameter", x, entry
                     )
-                    column.widen_bounds(estimate["lower"], estimate["upper"])
+                    column.widen_bounds(estimate.lower, estimate.upper)
             for name, unit, entry in _average_onsets(row.id, row.onset_delays):
-                _add_estimate(columns, name, unit, "onset delay", x, entry).widen_bounds(0.0, None)
+                _add_estimate(columns, name, unit, "onset delay", x, entry).widen_bounds(0.0, inf)
     order = {name: number for number, name in enumerate(names)}
     named = sorted(columns.items(), key=lambda item: order.get(item[0], len(order)))
     return [_build_quantity(name, column) for name, column in named]
@@ -123,42 +121,41 @@ def _add_estimate(
     return column
 
 
-def read_onset_estimates(onsets: Sequence[Mapping[str, Any]]) -> dict[str, TrendEstimate]:
+def read_onset_estimates(onsets: Sequence[OnsetDelay]) -> dict[str, TrendEstimate]:
     """Read the onset delays of a result that have standard errors, by their names in a trend."""
     estimates = {name: _to_estimate(entry) for name, _, entry in _average_onsets("", onsets)}
     return {name: estimate for name, estimate in estimates.items() if estimate is not None}
 
 
-def _average_onsets(
-    run: str, onsets: Sequence[Mapping[str, Any]]
-) -> list[tuple[str, str, _RunEstimate]]:
+def _average_onsets(run: str, onsets: Sequence[OnsetDelay]) -> list[tuple[str, str, _RunEstimate]]:
     """Average the onset delays of a run over its experiments, with standard errors."""
-    pairs: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    pairs: dict[tuple[str, str], list[OnsetDelay]] = {}
     for onset in onsets:
-        pairs.setdefault((onset["input"], onset["output"]), []).append(onset)
+        pairs.setdefault((onset.input, onset.output), []).append(onset)
     averages = []
     for (first, then), experiments in pairs.items():
-        measured = [experiment for experiment in experiments if experiment["delay"] is not None]
+        delays = [onset.delay for onset in experiments if onset.delay is not None]
+        measured = [onset for onset in experiments if onset.delay is not None]
         name = "onset delay" if len(pairs) == 1 else f"onset delay {first} → {then}"
         if not measured:
             averages.append(
-                (name, experiments[0]["unit"], _RunEstimate(run, None, None, "not measured"))
+                (name, experiments[0].unit, _RunEstimate(run, None, None, "not measured"))
             )
             continue
         n = len(measured)
-        value = sum(experiment["delay"] for experiment in measured) / n
+        value = sum(delays) / n
         errors = [_compute_onset_error(experiment) for experiment in measured]
         error = None if None in errors else sum(e**2 for e in errors if e is not None) ** 0.5 / n
-        averages.append((name, measured[0]["unit"], _RunEstimate(run, value, error, "measured")))
+        averages.append((name, measured[0].unit, _RunEstimate(run, value, error, "measured")))
     return averages
 
 
-def _compute_onset_error(onset: Mapping[str, Any]) -> float | None:
+def _compute_onset_error(onset: OnsetDelay) -> float | None:
     """Compute the standard error of a median of n events that scatter by `spread`."""
-    if not onset["spread"] or onset["events"] < 2:
+    if not onset.spread or onset.events < 2:
         return None
     median_over_mean = 1.2533  # √(π/2), of normally distributed events
-    return float(median_over_mean * onset["spread"] / onset["events"] ** 0.5)
+    return float(median_over_mean * onset.spread / onset.events**0.5)
 
 
 def _build_quantity(name: str, column: _QuantityEstimates) -> TrendQuantity:
@@ -210,17 +207,17 @@ def to_label_out(
     """Describe all runs of a label; `datasets` of each run, `channels` of the model's signals."""
     spans: dict[str, SpanOut] = {}
     for row in rows:
-        for metrics in row.agreement["estimation"]:
-            low, high = metrics["span"]
-            if low is None or high is None:
+        for metrics in row.agreement.estimation:
+            low, high = metrics.span
+            if not (isfinite(low) and isfinite(high)):
                 continue
-            channel = channels.get(metrics["output"], metrics["output"])
-            unit = _find_unit(dataset_channels, datasets.get(row.id, ()), channel, metrics["unit"])
-            before = spans.get(metrics["output"])
+            channel = channels.get(metrics.output, metrics.output)
+            unit = _find_unit(dataset_channels, datasets.get(row.id, ()), channel, metrics.unit)
+            before = spans.get(metrics.output)
             if before is not None:
                 low, high = min(low, before.lower), max(high, before.upper)
-            spans[metrics["output"]] = SpanOut(
-                output=metrics["output"], channel=channel, unit=unit, lower=low, upper=high
+            spans[metrics.output] = SpanOut(
+                output=metrics.output, channel=channel, unit=unit, lower=low, upper=high
             )
     return BatchLabelOut(
         x=x,

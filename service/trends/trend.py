@@ -9,7 +9,6 @@ from service.core.computed import ComputedValues
 from service.core.errors import Conflict, InvalidRequest
 from service.core.json_pointer import build_run_body
 from service.core.states import JobState
-from service.jobs.results import read_noise_model
 from service.repositories.jobs import JobRepository
 from service.repositories.lineage import list_reference_names
 from service.repositories.runs import RunRepository
@@ -104,7 +103,7 @@ def _compute(session: Session, job: Job, outliers: OutlierRule) -> TrendOut:
         for quantity in quantities
     ]
     reference_noise_model = (
-        "" if reference is None else read_noise_model(reference.run.result or {})
+        "" if reference is None else (reference.run.result or {}).get("noise_model", "white")
     )
     notes = [describe_noise_models(request["x"], rows_by_label, reference_noise_model)]
     if reference is not None:

@@ -32,7 +32,21 @@ from sysid.models.model import Model, ModelSignal, Output
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedValue:
-    """Value of one parameter or initial state; `stderr` in `unit`."""
+    """Value of one parameter or initial state, estimated or given.
+
+    Attributes
+    ----------
+    name : str
+        Name of the parameter, or of the initial state as ``x(0)``.
+    value : float
+        Value, in `unit`.
+    unit : str
+        Unit of value and standard error.
+    stderr : float or None
+        Standard error, in `unit`; none without one.
+    status : str
+        Status of the estimate; empty if the value was given.
+    """
 
     name: str
     value: float
@@ -43,7 +57,15 @@ class IdentifiedValue:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Covariance:
-    """Covariance (D, D) of the free parameters `names`, in products of their units."""
+    """Covariance of the free parameters, in products of their units.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Parameters of the rows and columns.
+    matrix : FloatArray, shape (D, D)
+        Rows of the matrix.
+    """
 
     names: tuple[str, ...]
     matrix: FloatArray

@@ -19,7 +19,7 @@ from sysid.data.records import Channel, Record
 from sysid.kernels.reads import is_difference
 from sysid.residuals.feedback import find_commands
 from sysid.residuals.residual_tests import list_residual_series
-from sysid.results.result import InputHold
+from sysid.results.parts import InputHold
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate

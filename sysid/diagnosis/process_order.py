@@ -36,7 +36,7 @@ from sysid.models.model import name_initial_state, replace_substeps
 from sysid.noise_models.generalised_least_squares import WhitenedLeastSquares
 from sysid.residuals.series import is_coloured, iterate_parts, make_whitening
 from sysid.residuals.whitening import Whitening
-from sysid.results.result import OrderComparison, OrderFit
+from sysid.results.parts import OrderComparison, OrderFit, compare_fits
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit, to_unit
@@ -128,12 +128,12 @@ def compare_orders(
         for fitted in fits
         if fitted.entry.parts == len(assumptions.process.time_constants)
     )
-    comparison = OrderComparison(
+    comparison = compare_fits(
         own,
         assumptions.delay.name,
         assumptions.delay.unit,
         "ar1" if has_colour else "white",
-        tuple(compared),
+        compared,
     )
     if bounded & {own, comparison.preferred_model}:
         return None, spent

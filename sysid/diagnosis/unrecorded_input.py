@@ -30,7 +30,7 @@ from sysid.language.functions import Interval
 from sysid.minima.minima import Fit, collect_minima, scan_parameters
 from sysid.models.delays import compute_longest_delay, list_past_values
 from sysid.models.model import EstimatedInitial
-from sysid.results.result import Minimum
+from sysid.results.parts import Minimum
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale

@@ -30,7 +30,7 @@ from sysid.diagnosis.warnings import find_delay_parameters
 from sysid.minima.minima import scan_parameters
 from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.series import is_coloured, iterate_parts
-from sysid.results.result import InputHold
+from sysid.results.parts import InputHold
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate

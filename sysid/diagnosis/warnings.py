@@ -335,12 +335,12 @@ def _warn_coloured_residuals(
     """
     uncertainty = analysis.uncertainty
     if all(
-        test.kind != "whiteness" or test.p is None or test.p > _WHITENESS_LEVEL
+        test.test != "whiteness" or test.p is None or test.p > _WHITENESS_LEVEL
         for test in tests.tests
     ):
         return []
     colour = "white" if uncertainty is None else uncertainty.noise_colour
-    depends = any(test.kind == "independence" and test.outcome == "failed" for test in tests.tests)
+    depends = any(test.test == "independence" and test.outcome == "failed" for test in tests.tests)
     advises = may_be_noise and colour in ("coloured", "drifting") and not depends
     if delay_names and uncertainty and (tests.data, colour) == ("validation", "white"):
         return [

@@ -8,11 +8,11 @@ import json
 import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from math import isfinite
 from typing import Any
 
 from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
 from sysid.core.text import find_shown_error
+from sysid.core.value_documents import encode
 from sysid.export.identifiers import to_one_line
 from sysid.models.model import DerivedInitial, MeasuredInitial, name_initial_state
 
@@ -123,18 +123,12 @@ def write_json_source(identified: IdentifiedModel) -> str:
 
 
 def _to_document(identified: IdentifiedModel) -> dict[str, Any]:
-    covariance = identified.covariance
     return {
         "format": JSON_FORMAT,
         "lagid": identified.version or None,
         "model": dict(identified.model.document),
-        "values": [_to_value_document(item) for item in identified.values],
-        "covariance": None
-        if covariance is None
-        else {
-            "names": list(covariance.names),
-            "matrix": [[_to_finite(value) for value in row] for row in covariance.matrix],
-        },
+        "values": [encode(item) for item in identified.values],
+        "covariance": None if identified.covariance is None else encode(identified.covariance),
         "data": {
             "sample_time": identified.sample_time,
             "hold": {item.name: identified.get_hold(item.name) for item in identified.model.inputs},
@@ -145,18 +139,3 @@ def _to_document(identified: IdentifiedModel) -> dict[str, Any]:
         },
         "provenance": dict(identified.provenance),
     }
-
-
-def _to_value_document(value: IdentifiedValue) -> dict[str, Any]:
-    return {
-        "name": value.name,
-        "value": float(value.value),
-        "unit": value.unit,
-        "stderr": _to_finite(value.stderr),
-        "status": value.status,
-    }
-
-
-def _to_finite(value: float | None) -> float | None:
-    """Replace a number that is not finite by None, because JSON has none."""
-    return None if value is None or not isfinite(value) else float(value)

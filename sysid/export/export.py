@@ -17,7 +17,7 @@ from sysid.language.evaluation import evaluate_expression
 from sysid.models.model import Model, name_initial_state
 from sysid.models.parse import keep_terms
 from sysid.models.ties import resolve_ties
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.simulation.data_bounds import find_signal_units
 
 ExportFormat = Literal["json", "python", "c", "control"]
@@ -125,12 +125,11 @@ def _collect_values(
             IdentifiedValue(
                 estimate.name, estimate.value, estimate.unit, estimate.stderr, estimate.status
             )
-            for estimate in result.estimates
+            for estimate in result.parameters
         )
-        uncertainty = result.uncertainty
-        return values, None if uncertainty is None else Covariance(
-            uncertainty.names, uncertainty.covariance
-        )
+        if result.correlation is None or result.covariance is None:
+            return values, None
+        return values, Covariance(result.correlation.names, result.covariance)
     units = {estimate.name: estimate.unit for estimate in model.parameters}
     units |= {name_initial_state(state.name, 0): state.unit for state in model.states}
     numbers = _add_tied_values(model, result)

@@ -2,58 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.models.parameters import Parameter
+from sysid.search.state import Improvement
+from sysid.uncertainty.estimates import Estimate
+
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class IslandImprovement:
-    """A better champion of one island; `parameters` in the order of the free parameters."""
-
-    generation: int
-    evaluations: int
-    rms: float
-    phase: str
-    parameters: tuple[float, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class FreeParameter:
-    """A free parameter: its bounds, and its estimate if it exists.
-
-    If the bounds follow the data, they are unknown (`follows_data`) until there is a result.
-    """
-
-    name: str
-    unit: str
-    lower: float
-    upper: float
-    scale: Literal["linear", "log"] = "linear"
-    value: float | None = None
-    stderr: float | None = None
-    follows_data: bool = False
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CornerParameter:
-    """A free parameter with its estimate, and samples (n,) of its posterior.
-
-    `interval95` is that of the estimate, `posterior95` has the quantiles of the samples.
-    """
-
-    name: str
-    unit: str
-    lower: float
-    upper: float
-    value: float
-    stderr: float | None
-    interval95: Sequence[float] | None
-    posterior95: Sequence[float]
-    samples: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,8 +76,8 @@ class CorrelationTrace:
 
 
 @dataclass(frozen=True, slots=True)
-class RunFigureData:
-    """Data of one run's search and result.
+class SearchTraces:
+    """The search of one run, finished or not.
 
     Attributes
     ----------
@@ -128,26 +85,23 @@ class RunFigureData:
         Unit of the RMS.
     fitness_label : str
         What the search minimised: the RMS, or a robust loss expressed as an RMS.
+    parameters : sequence of Parameter
+        The free parameters, with the bounds that are drawn.
+    estimates : mapping of str to Estimate
+        Estimates by name; empty until there is a result.
     history : sequence of sequence of Improvement
         One sequence per island, in the order of the generations.
     epoch : int
         Generations between two migrations; 0 without migration.
     migrations : sequence of int
         Epochs after which individuals migrated.
-    islands : sequence of (champion RMS, refined RMS or None)
-        Result of each island.
-    correlation : mapping or None
-        ``{"names": [...], "matrix": [[...]]}``.
     """
 
-    id: str
     unit: str
     fitness_label: str = "RMS"
     generations: int = 0
-    evaluations: int = 0
-    parameters: Sequence[FreeParameter] = ()
-    history: Sequence[Sequence[IslandImprovement]] = ()
+    parameters: Sequence[Parameter] = ()
+    estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    history: Sequence[Sequence[Improvement]] = ()
     epoch: int = 0
     migrations: Sequence[int] = ()
-    islands: Sequence[tuple[float, float | None]] = ()
-    correlation: Mapping[str, Any] | None = field(default=None)

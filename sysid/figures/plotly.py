@@ -9,11 +9,20 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sysid.core.text import append_unit, bracket_unit, join_estimate, plain_unit
+from sysid.core.text import (
+    append_unit,
+    bracket_unit,
+    find_shown_error,
+    join_estimate,
+    plain_unit,
+)
 from sysid.figures import theme
-from sysid.figures.data import Floats, FreeParameter, IslandImprovement, RunFigureData
+from sysid.figures.data import Floats, SearchTraces
 from sysid.figures.grid import Place, PlotGrid, add_axes, add_caption
 from sysid.figures.theme import stride_indices
+from sysid.models.parameters import Parameter
+from sysid.search.state import Improvement, IslandSummary
+from sysid.uncertainty.estimates import CorrelationMatrix, Estimate
 
 Figure = dict[str, Any]
 Abscissa = Literal["generations", "evaluations"]
@@ -63,7 +72,7 @@ def apply_theme(figure: Figure, paper: theme.Theme) -> Figure:
     return {**figure, "layout": {**figure["layout"], "template": theme.plotly_template(paper)}}
 
 
-def plot_history(run: RunFigureData, abscissa: Abscissa = "generations") -> Figure:
+def plot_history(run: SearchTraces, abscissa: Abscissa = "generations") -> Figure:
     """Draw the fitness of every island's champion over generations or evaluations."""
     end = _last_abscissa(run, abscissa)
     lines = [
@@ -78,14 +87,14 @@ def plot_history(run: RunFigureData, abscissa: Abscissa = "generations") -> Figu
         "layout": base_layout(
             360,
             xaxis={"title": {"text": abscissa}, "rangemode": "tozero"},
-            yaxis=_fitness_axis(run, data),
+            yaxis=_fitness_axis(run.unit, run.fitness_label, data),
             shapes=[_vertical_line(epoch * run.epoch) for epoch in _distinct_epochs(epochs)],
             uirevision=abscissa,
         ),
     }
 
 
-def plot_convergence(run: RunFigureData, columns: int = 3) -> Figure:
+def plot_convergence(run: SearchTraces, columns: int = 3) -> Figure:
     """Draw the free parameters of the islands' champions over generations, with their bounds."""
     parameters = run.parameters
     grid = _parameter_grid(len(parameters), columns)
@@ -122,10 +131,10 @@ def correlation_height(n_parameters: int) -> int:
     return min(130 + max(n_parameters, 3) * (46 if n_parameters <= 12 else 24), 760)
 
 
-def plot_correlation(run: RunFigureData) -> Figure:
+def plot_correlation(correlation: CorrelationMatrix | None) -> Figure:
     """Draw the correlation matrix of the estimates, from −1 to 1."""
-    names = list((run.correlation or {}).get("names", ()))
-    rows = [to_json_numbers(row) for row in (run.correlation or {}).get("matrix", ())]
+    names = [] if correlation is None else list(correlation.names)
+    rows = [] if correlation is None else [to_json_numbers(row) for row in correlation.matrix]
     few = len(names) <= 12
     matrix = {
         "type": "heatmap",
@@ -159,29 +168,30 @@ def plot_correlation(run: RunFigureData) -> Figure:
     }
 
 
-def plot_waterfall(run: RunFigureData) -> Figure:
+def plot_waterfall(
+    islands: Sequence[IslandSummary], unit: str, fitness_label: str = "RMS"
+) -> Figure:
     """Draw the final fitness of each island, best first, before and after refinement."""
-    order = sorted(range(len(run.islands)), key=lambda i: _final_fitness(run.islands[i]))
-    rank = list(range(1, len(order) + 1))
-    islands = [f"island {i + 1}" for i in order]
-    series = [("after the search", theme.GREY, "circle-open", 0)]
-    if any(refined is not None for _, refined in run.islands):
-        series.append(("after refinement", theme.BLUE, "circle", 1))
+    order = sorted(range(len(islands)), key=lambda i: _find_final_fitness(islands[i]))
+    ordered, rank = [islands[i] for i in order], list(range(1, len(order) + 1))
+    refined = [np.nan if one.refined_rms is None else one.refined_rms for one in ordered]
+    champions = [one.champion_rms for one in ordered]
+    series = [("after the search", theme.GREY, "circle-open", champions)]
+    if any(one.refined_rms is not None for one in islands):
+        series.append(("after refinement", theme.BLUE, "circle", refined))
     data = [
         {
             "type": "scatter",
             "mode": "lines+markers",
             "name": name,
             "x": rank,
-            "y": to_json_numbers(
-                np.nan if (v := run.islands[i][part]) is None else v for i in order
-            ),
-            "text": islands,
+            "y": to_json_numbers(values),
+            "text": [f"island {i + 1}" for i in order],
             "line": {"color": colour, "width": 1, "dash": "dot"},
             "marker": {"color": colour, "symbol": symbol, "size": 9},
-            "hovertemplate": "%{text}: %{y:.5g} " + run.unit + "<extra></extra>",
+            "hovertemplate": f"%{{text}}: %{{y:.5g}} {unit}<extra></extra>",
         }
-        for name, colour, symbol, part in series
+        for name, colour, symbol, values in series
     ]
     return {
         "data": data if order else [],
@@ -192,23 +202,23 @@ def plot_waterfall(run: RunFigureData) -> Figure:
                 "dtick": max(1, len(order) // 12),
                 "range": [0.5, len(order) + 0.5],
             },
-            yaxis=_fitness_axis(run, data),
+            yaxis=_fitness_axis(unit, fitness_label, data),
         ),
     }
 
 
-def _abscissa_value(point: IslandImprovement, abscissa: Abscissa) -> int:
+def _abscissa_value(point: Improvement, abscissa: Abscissa) -> int:
     return point.generation if abscissa == "generations" else point.evaluations
 
 
-def _last_abscissa(run: RunFigureData, abscissa: Abscissa) -> int:
+def _last_abscissa(run: SearchTraces, abscissa: Abscissa) -> int:
     last = [_abscissa_value(points[-1], abscissa) for points in run.history if points]
     # A run's evaluations are the sum over its islands; each island counts only its own.
     return max([*last, run.generations if abscissa == "generations" else 0])
 
 
 def _step_points(
-    points: Sequence[IslandImprovement], abscissa: Abscissa, end: int
+    points: Sequence[Improvement], abscissa: Abscissa, end: int
 ) -> tuple[list[int], Any]:
     thinned = [points[i] for i in stride_indices(len(points), 990)]
     ahead = [end] if _abscissa_value(thinned[-1], abscissa) < end else []
@@ -219,7 +229,7 @@ def _step_points(
 
 
 def _island_line(
-    number: int, points: Sequence[IslandImprovement], abscissa: Abscissa, end: int
+    number: int, points: Sequence[Improvement], abscissa: Abscissa, end: int
 ) -> dict[str, Any]:
     x, thinned = _step_points(points, abscissa, end)
     return {
@@ -233,7 +243,7 @@ def _island_line(
     }
 
 
-def _phase_markers(run: RunFigureData, abscissa: Abscissa) -> list[dict[str, Any]]:
+def _phase_markers(run: SearchTraces, abscissa: Abscissa) -> list[dict[str, Any]]:
     markers = []
     for phase, (name, symbol) in _PHASE_MARKERS.items():
         marked = [
@@ -269,9 +279,9 @@ def _distinct_epochs(epochs: Sequence[int]) -> list[int]:
     return distinct if len(distinct) <= _MAX_MARKED_EPOCHS else []
 
 
-def _fitness_axis(run: RunFigureData, data: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _fitness_axis(unit: str, label: str, data: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Build the axis of the fitness; `data` are its traces."""
-    title = {"text": run.fitness_label + bracket_unit(run.unit)}
+    title = {"text": label + bracket_unit(unit)}
     # Below one decade the axis would show only digits and no power of ten.
     axis = {"title": title, "type": "log", "exponentformat": "e", "minorloglabels": "complete"}
     positive = [y for trace in data for y in trace["y"] if y is not None and y > 0]
@@ -293,13 +303,14 @@ def _vertical_line(x: float) -> dict[str, Any]:
     }
 
 
-def _final_fitness(island: tuple[float, float | None]) -> float:
-    champion, refined = island
-    return champion if refined is None else refined
+def _find_final_fitness(island: IslandSummary) -> float:
+    """Find the fitness after refinement, or else before it; the worst if it is not finite."""
+    fitness = island.champion_rms if island.refined_rms is None else island.refined_rms
+    return fitness if np.isfinite(fitness) else np.inf
 
 
 def _add_parameter_plot(
-    figure: Figure, run: RunFigureData, number: int, parameter: FreeParameter, domain: Place
+    figure: Figure, run: SearchTraces, number: int, parameter: Parameter, domain: Place
 ) -> None:
     axis_names = add_axes(
         figure,
@@ -333,10 +344,11 @@ def _add_parameter_plot(
     figure["layout"]["shapes"] += [
         _bound_line(bound, axis_names) for bound in (parameter.lower, parameter.upper)
     ]
-    add_caption(figure, _parameter_caption(parameter), domain)
+    estimate = run.estimates.get(parameter.name)
+    add_caption(figure, _write_caption(parameter, estimate), domain)
 
 
-def _bounds_axis(parameter: FreeParameter) -> dict[str, Any]:
+def _bounds_axis(parameter: Parameter) -> dict[str, Any]:
     lower, upper = parameter.lower, parameter.upper
     if parameter.scale == "log":
         lower, upper = float(np.log10(lower)), float(np.log10(upper))
@@ -358,8 +370,8 @@ def _bound_line(y: float, axis_names: dict[str, str]) -> dict[str, Any]:
     }
 
 
-def _parameter_caption(parameter: FreeParameter) -> str:
-    if parameter.value is None:
+def _write_caption(parameter: Parameter, estimate: Estimate | None) -> str:
+    if estimate is None:
         return append_unit(f"<b>{parameter.name}</b>", parameter.unit)
-    estimate = join_estimate(parameter.value, parameter.stderr)
-    return f"<b>{parameter.name}</b> = {estimate}{plain_unit(parameter.unit)}"
+    text = join_estimate(estimate.value, find_shown_error(estimate.stderr, estimate.status))
+    return f"<b>{parameter.name}</b> = {text}{plain_unit(parameter.unit)}"

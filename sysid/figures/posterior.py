@@ -2,17 +2,23 @@
 
 from collections.abc import Sequence
 from itertools import combinations
-from math import pi, sqrt
-from typing import Any
+from math import isfinite, pi, sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sysid.core.text import append_unit
 from sysid.figures import theme
-from sysid.figures.data import CornerParameter, Floats
+from sysid.figures.data import Floats
 from sysid.figures.grid import add_axes
 from sysid.figures.plotly import Figure, base_layout, empty_figure, to_json_numbers
 from sysid.figures.theme import stride_indices
+from sysid.uncertainty.estimates import (
+    CorrelationMatrix,
+    Estimate,
+    Posterior,
+    PosteriorParameter,
+)
 
 MAX_SHOWN = 6
 """Parameters that a corner plot shows."""
@@ -27,22 +33,40 @@ _ELLIPSE_RADIUS, _ELLIPSE_POINTS = sqrt(5.991), 60  # 95 % of χ² with two degr
 _DASHED = {"color": theme.VERMILLION, "width": 1.4, "dash": "dash"}
 
 
+class Corner(NamedTuple):
+    """A free parameter: its estimate, its posterior, and the samples (n,) of that."""
+
+    estimate: Estimate
+    sampled: PosteriorParameter
+    samples: Floats
+
+
 def posterior_height(n_parameters: int) -> int:
     """Compute the height (px) of the corner plot, so that a page can reserve its room."""
     return min(n_parameters, MAX_SHOWN) * _CELL_PX + _MARGIN["t"] + _MARGIN["b"]
 
 
 def plot_posterior(
-    parameters: Sequence[CornerParameter], correlation: Floats, *, is_narrow: bool = False
+    posterior: Posterior | None,
+    estimates: Sequence[Estimate],
+    correlation: CorrelationMatrix | None,
+    *,
+    is_narrow: bool = False,
 ) -> Figure:
     """Draw histograms on the diagonal, and pairs of samples with their 95 % regions below.
 
-    `correlation` (D, D) is that of the estimates. With their standard errors it gives the dashed
-    ellipses. Of many parameters only those that are most correlated are shown. On a narrow page
-    the legend is above the cells, which have fewer ticks.
+    The `correlation` of the estimates, with their standard errors, gives the dashed ellipses. Of
+    many parameters only those that are most correlated are shown. On a narrow page the legend is
+    above the cells, which have fewer ticks. Without samples the figure is empty.
     """
-    if not parameters:
+    if posterior is None or not posterior.parameters:
         return empty_figure()
+    by_name = {estimate.name: estimate for estimate in estimates}
+    parameters = [
+        Corner(by_name[sampled.name], sampled, posterior.samples[:, column])
+        for column, sampled in enumerate(posterior.parameters)
+    ]
+    matrix = np.eye(len(parameters)) if correlation is None else correlation.matrix
     chosen = choose_shown(parameters)
     shown = [parameters[i] for i in chosen]
     margin = _NARROW_MARGIN if is_narrow else _MARGIN
@@ -61,9 +85,7 @@ def plot_posterior(
         names = _add_cell(figure, shown, row, column)
         pair = shown[column], shown[row]
         figure["data"] += _draw_samples(*pair, names)
-        figure["data"] += _draw_ellipse(
-            *pair, float(correlation[chosen[column], chosen[row]]), names
-        )
+        figure["data"] += _draw_ellipse(*pair, float(matrix[chosen[column], chosen[row]]), names)
     for place, parameter in enumerate(shown):
         names = _add_cell(figure, shown, place, place)
         figure["data"].append(_draw_histogram(parameter, names))
@@ -89,7 +111,7 @@ def _thin_ticks(figure: Figure) -> None:
             axis |= {"nticks": 2, "tickangle": 0, "tickfont": {"size": 10}}
 
 
-def choose_shown(parameters: Sequence[CornerParameter]) -> list[int]:
+def choose_shown(parameters: Sequence[Corner]) -> list[int]:
     """Choose the parameters to show: all, or those whose samples are most correlated with another.
 
     Returned are their indices in the original order.
@@ -102,9 +124,7 @@ def choose_shown(parameters: Sequence[CornerParameter]) -> list[int]:
     return sorted(np.argsort(-np.max(strength, axis=0), kind="stable")[:MAX_SHOWN].tolist())
 
 
-def _add_cell(
-    figure: Figure, shown: Sequence[CornerParameter], row: int, column: int
-) -> dict[str, str]:
+def _add_cell(figure: Figure, shown: Sequence[Corner], row: int, column: int) -> dict[str, str]:
     """Add the axes of a cell; titles and ticks only on the left and at the bottom."""
     n = len(shown)
     width = (1.0 - _GAP * (n - 1)) / n
@@ -113,9 +133,9 @@ def _add_cell(
     x: dict[str, Any] = {"nticks": 4, "showticklabels": row == n - 1}
     y: dict[str, Any] = {"nticks": 4, "showticklabels": column == 0 and not is_histogram}
     if row == n - 1:
-        x["title"] = {"text": append_unit(shown[column].name, shown[column].unit)}
+        x["title"] = {"text": append_unit(shown[column].sampled.name, shown[column].sampled.unit)}
     if column == 0 and not is_histogram:
-        y["title"] = {"text": append_unit(shown[row].name, shown[row].unit)}
+        y["title"] = {"text": append_unit(shown[row].sampled.name, shown[row].sampled.unit)}
     x["range"] = _find_range(shown[column])
     y |= (
         {"visible": False, "rangemode": "tozero"}
@@ -126,17 +146,15 @@ def _add_cell(
     return add_axes(figure, row * n + column, domain, x, y)
 
 
-def _find_range(parameter: CornerParameter) -> list[float]:
+def _find_range(parameter: Corner) -> list[float]:
     """Find the range of an axis: that of the samples and the estimate, with room."""
-    values = [*parameter.samples.tolist(), parameter.value]
+    values = [*parameter.samples.tolist(), parameter.estimate.value]
     low, high = min(values), max(values)
     room = 0.05 * (high - low) or 0.5 * abs(high) or 0.5
     return [low - room, high + room]
 
 
-def _draw_samples(
-    across: CornerParameter, upward: CornerParameter, names: dict[str, str]
-) -> list[dict[str, Any]]:
+def _draw_samples(across: Corner, upward: Corner, names: dict[str, str]) -> list[dict[str, Any]]:
     """Draw samples of a pair, and the region of highest density that has 95 % of them."""
     chosen = stride_indices(across.samples.size, _MAX_POINTS)
     points = {
@@ -147,14 +165,15 @@ def _draw_samples(
         "y": to_json_numbers(upward.samples[chosen]),
         **names,
         "marker": {"color": theme.BLUE, "size": 3, "opacity": 0.45},
-        "hovertemplate": f"{across.name} = %{{x:.5g}}<br>{upward.name} = %{{y:.5g}}<extra></extra>",
+        "hovertemplate": f"{across.sampled.name} = %{{x:.5g}}<br>"
+        f"{upward.sampled.name} = %{{y:.5g}}<extra></extra>",
     }
     estimate = {
         "type": "scatter",
         "mode": "markers",
         "name": "estimate",
-        "x": to_json_numbers([across.value]),
-        "y": to_json_numbers([upward.value]),
+        "x": to_json_numbers([across.estimate.value]),
+        "y": to_json_numbers([upward.estimate.value]),
         **names,
         "marker": {"color": theme.VERMILLION, "size": 8, "symbol": "cross"},
         "hoverinfo": "skip",
@@ -177,9 +196,7 @@ def _draw_samples(
     return [points, region, estimate]
 
 
-def estimate_region(
-    across: CornerParameter, upward: CornerParameter
-) -> tuple[Floats, Floats, Floats, float]:
+def estimate_region(across: Corner, upward: Corner) -> tuple[Floats, Floats, Floats, float]:
     """Estimate the density of a pair on a grid, and its level that 95 % of the samples exceed.
 
     Returned are the grid between the bounds, the density (y, x), 1 at most, and the level. The
@@ -193,13 +210,14 @@ def estimate_region(
     return x, y, density / highest, level / highest
 
 
-def _lay_grid(parameter: CornerParameter) -> Floats:
+def _lay_grid(parameter: Corner) -> Floats:
     room = _ROOM * _find_bandwidth(parameter.samples)
     low, high = float(np.min(parameter.samples)) - room, float(np.max(parameter.samples)) + room
-    return np.linspace(max(low, parameter.lower), min(high, parameter.upper), _CELLS)
+    lower, upper = parameter.estimate.lower, parameter.estimate.upper
+    return np.linspace(max(low, lower), min(high, upper), _CELLS)
 
 
-def _compute_kernels(parameter: CornerParameter, places: Floats) -> Floats:
+def _compute_kernels(parameter: Corner, places: Floats) -> Floats:
     """Compute the kernels (P, n) of all samples at places (P,)."""
     distances = (places[:, None] - parameter.samples) / _find_bandwidth(parameter.samples)
     return np.asarray(np.exp(-0.5 * distances**2))
@@ -213,10 +231,10 @@ def _find_bandwidth(values: Floats) -> float:
 
 
 def _draw_ellipse(
-    across: CornerParameter, upward: CornerParameter, correlation: float, names: dict[str, str]
+    across: Corner, upward: Corner, correlation: float, names: dict[str, str]
 ) -> list[dict[str, Any]]:
     """Draw the 95 % ellipse of the standard errors, if both parameters have one."""
-    if across.stderr is None or upward.stderr is None:
+    if across.estimate.stderr is None or upward.estimate.stderr is None:
         return []
     angle = np.linspace(0.0, 2.0 * pi, _ELLIPSE_POINTS)
     first = _ELLIPSE_RADIUS * np.cos(angle)
@@ -226,8 +244,8 @@ def _draw_ellipse(
             "type": "scatter",
             "mode": "lines",
             "name": "95 % ellipse of the standard errors",
-            "x": to_json_numbers(across.value + across.stderr * first),
-            "y": to_json_numbers(upward.value + upward.stderr * second),
+            "x": to_json_numbers(across.estimate.value + across.estimate.stderr * first),
+            "y": to_json_numbers(upward.estimate.value + upward.estimate.stderr * second),
             **names,
             "line": _DASHED,
             "hoverinfo": "skip",
@@ -235,25 +253,26 @@ def _draw_ellipse(
     ]
 
 
-def _draw_histogram(parameter: CornerParameter, names: dict[str, str]) -> dict[str, Any]:
+def _draw_histogram(parameter: Corner, names: dict[str, str]) -> dict[str, Any]:
     counts, edges = np.histogram(parameter.samples, _BINS)
     return {
         "type": "bar",
-        "name": parameter.name,
+        "name": parameter.sampled.name,
         "x": to_json_numbers(0.5 * (edges[1:] + edges[:-1])),
         "y": counts.tolist(),
         **names,
         "marker": {"color": theme.BLUE, "opacity": 0.45},
         "showlegend": False,
-        "hovertemplate": f"{parameter.name} = %{{x:.5g}}<extra></extra>",
+        "hovertemplate": f"{parameter.sampled.name} = %{{x:.5g}}<extra></extra>",
     }
 
 
-def _draw_interval(parameter: CornerParameter, names: dict[str, str]) -> list[dict[str, Any]]:
+def _draw_interval(parameter: Corner, names: dict[str, str]) -> list[dict[str, Any]]:
     """Draw the estimate and the ends of both intervals."""
-    lines = [(end, {"color": theme.BLUE, "width": 1.4}) for end in parameter.posterior95]
-    lines += [(end, _DASHED) for end in parameter.interval95 or ()]
-    lines.append((parameter.value, {"color": theme.VERMILLION, "width": 1.4}))
+    lines = [(end, {"color": theme.BLUE, "width": 1.4}) for end in parameter.sampled.interval95]
+    ends = filter(isfinite, parameter.estimate.interval95 or ())
+    lines += [(end, _DASHED) for end in ends]
+    lines.append((parameter.estimate.value, {"color": theme.VERMILLION, "width": 1.4}))
     return [
         {
             "type": "line",

@@ -29,12 +29,13 @@ class IdentifiableCombination:
     Attributes
     ----------
     members : tuple of str
-        The parameters of the combination.
+        Names of the parameters of the combination.
     expression : str
         A product of powers, such as ``A_m*k_b/J``, or else a sum, such as ``T + L``.
     value : float
+        Estimate of the combination; its unit follows from its parameters.
     stderr : float or None
-        Standard error of `value`.
+        Standard error of `value`, in the same unit.
     is_local : bool
         Whether the combination holds near the estimate only, as a sum in place of
         ``K*exp(-E/300)``.

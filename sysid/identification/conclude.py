@@ -1,6 +1,7 @@
 """Conclude a search: refinement, uncertainty, validation, warnings."""
 
 from dataclasses import replace
+from math import inf
 
 import numpy as np
 
@@ -54,10 +55,13 @@ from sysid.noise_models.noise_model_choice import resolve_noise_model
 from sysid.residuals.feedback import describe_feedback
 from sysid.residuals.onset_delay import estimate_onset_delays
 from sysid.residuals.residual_tests import list_residual_series, run_residual_tests
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
+from sysid.results.result import Agreements, FitPercent, Identifiability, KnownBefore
+from sysid.results.verdict import Evidence, judge_result
 from sysid.search.state import Improvement, IslandSummary
 from sysid.simulation.problem import Problem, compute_metrics
 from sysid.uncertainty.analysis import Analysis
+from sysid.uncertainty.estimates import CorrelationMatrix, Uncertainty
 from sysid.uncertainty.posterior import describe_posterior, sample_posterior
 from sysid.uncertainty.unequal_noise import describe_unequal_noise
 
@@ -169,23 +173,62 @@ def _build_identification(
     )
     budget.spend(spent)
     analysis = replace(analysis, estimates=mark_prediction_dependent(analysis.estimates, ahead))
+    fit = FitPercent(
+        metrics.fit_percent, None if validated is None else validated.metrics.fit_percent
+    )
+    valid = limit is None or metrics.rms <= limit
+    delays, uncertainty = tuple(sorted(find_delay_parameters(problem))), analysis.uncertainty
     return Identification(
-        estimates=analysis.estimates,
+        valid=valid,
+        parameters=analysis.estimates,
         rms=metrics.rms,
-        fit_percent=metrics.fit_percent,
         rms_validation=None if validated is None else validated.metrics.rms,
-        fit_percent_validation=None if validated is None else validated.metrics.fit_percent,
-        valid=limit is None or metrics.rms <= limit,
+        fit_percent=fit,
+        agreement=Agreements(
+            metrics.channels, () if validated is None else validated.metrics.channels
+        ),
         evaluations=state.evaluations + budget.spent,
         generations=max(island.generation for island in state.islands),
         islands=_summarise_islands(state, best.ends),
-        history=_extend_histories(state, best.ends),
-        migrations=state.migrations,
-        uncertainty=analysis.uncertainty,
-        simulated=split_outputs(problem, simulated),
-        simulated_validation=() if validated is None else validated.simulated,
-        agreement=metrics.channels,
-        agreement_validation=() if validated is None else validated.metrics.channels,
+        identifiability=_describe_identifiability(uncertainty),
+        criteria=analysis.criteria,
+        correlation=None
+        if uncertainty is None
+        else CorrelationMatrix(uncertainty.names, uncertainty.correlation),
+        covariance=None if uncertainty is None else uncertainty.covariance,
+        degrees=inf if uncertainty is None else uncertainty.degrees,
+        noise_sd=None if uncertainty is None else uncertainty.noise_sd,
+        noise_colour=None if uncertainty is None else uncertainty.noise_colour,
+        noise_model="ar1" if any(times.values()) else "white",
+        correlation_times=times,
+        noise_deviations=None
+        if problem.settings.weights is not None
+        else problem.settings.deviations,
+        residual_tests=tests,
+        onset_delays=estimate_onset_delays(problem.model, problem.records),
+        data_bounds=tuple(p.name for p in problem.free_parameters if p.bounds is not None),
+        input_hold=holds,
+        known_before=KnownBefore(
+            _compute_input_history(problem),
+            () if validation is None else _compute_input_history(validation),
+        ),
+        search=evidence,
+        posterior=posterior,
+        order_comparison=orders,
+        delays=delays,
+        verdict=judge_result(
+            Evidence(
+                estimates=analysis.estimates,
+                valid=valid,
+                fit_percent=fit.estimation,
+                fit_percent_validation=fit.validation,
+                search=evidence,
+                tests=tests.tests,
+                delays=delays,
+                orders=orders,
+                channels=metrics.channels,
+            )
+        ),
         warnings=(
             *warn_refuted(metrics, validated),
             *warn_other_order(orders, problem.model.name),
@@ -216,25 +259,20 @@ def _build_identification(
             *filter(None, [noise.note]),
             *(() if posterior is None else describe_posterior(posterior, analysis.estimates)),
         ),
-        selection=() if problem.model.selection is None else problem.model.selection.terms,
-        criteria=analysis.criteria,
-        residual_tests=tests,
-        onset_delays=estimate_onset_delays(problem.model, problem.records),
-        correlation_times=times,
-        input_holds=holds,
-        data_bounds=tuple(p.name for p in problem.free_parameters if p.bounds is not None),
-        sample_time=problem.share("sample time", lambda: find_common_sample_time(problem.records)),
-        search=evidence,
         substeps=problem.model.solver.substeps,
-        known_before=_compute_input_history(problem),
-        known_before_validation=() if validation is None else _compute_input_history(validation),
-        posterior=posterior,
-        order_comparison=orders,
-        delays=tuple(sorted(find_delay_parameters(problem))),
-        noise_deviations=None
-        if problem.settings.weights is not None
-        else problem.settings.deviations,
+        selection=() if problem.model.selection is None else problem.model.selection.terms,
+        history=_extend_histories(state, best.ends),
+        migrations=state.migrations,
+        simulated=split_outputs(problem, simulated),
+        simulated_validation=() if validated is None else validated.simulated,
+        sample_time=problem.share("sample time", lambda: find_common_sample_time(problem.records)),
     )
+
+
+def _describe_identifiability(uncertainty: Uncertainty | None) -> Identifiability:
+    if uncertainty is None:
+        return Identifiability(None, (), np.zeros(0))
+    return Identifiability(uncertainty.condition, uncertainty.groups, uncertainty.singular_values)
 
 
 def _compute_input_history(problem: Problem) -> tuple[float, ...]:

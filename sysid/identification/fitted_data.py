@@ -11,12 +11,12 @@ from sysid.identification.fit_problems import FitRecords, ProblemPair
 from sysid.models.model import Model
 from sysid.residuals.past_outputs import count_past_output_coefficients
 from sysid.residuals.residual_tests import compute_correlations, list_residual_series
-from sysid.results.result import FittedData, Identification
+from sysid.results.result import FittedData, FullResult
 from sysid.simulation.problem import Problem
 
 
 def collect_fitted_data(
-    model: Model, records: FitRecords, problems: ProblemPair, found: Identification
+    model: Model, records: FitRecords, problems: ProblemPair, found: FullResult
 ) -> FittedData:
     """Collect model and records of a result, and correlate its residuals with both sides' lags."""
     problem, validation_problem = problems

@@ -29,7 +29,7 @@ from sysid.models.catalogue.load import resolve_model
 from sysid.models.delays import check_unused_settings
 from sysid.models.model import Model
 from sysid.models.units import check_signal_units
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 
 _PROGRESS_SECONDS = 0.25
 

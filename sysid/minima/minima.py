@@ -22,7 +22,7 @@ import numpy as np
 from sysid.core.types import BoolArray, FloatArray
 from sysid.core.units import format_unit
 from sysid.minima.projection import draw_projected_places
-from sysid.results.result import CHI_SQUARE_95, Minimum
+from sysid.results.parts import CHI_SQUARE_95, Minimum
 from sysid.search.archive import SAME_PLACE, ArchivedMinimum
 from sysid.search.refine import RefinedCandidate, refine_candidate
 from sysid.search.state import SAME_OPTIMUM
@@ -310,11 +310,12 @@ def collect_minima(
             near.append(i)
     return tuple(
         Minimum(
-            ordered[group[0]].theta,
+            dict(zip(problem.free_names, ordered[group[0]].theta.tolist(), strict=True)),
             ordered[group[0]].rms,
             sum(ordered[i].count for i in group),
             sum(ordered[i].independent for i in group),
             ratio,
+            ratio <= CHI_SQUARE_95,
             recorded_from,
         )
         for group, ratio in zip(groups[:_MOST_MINIMA], ratios, strict=False)

@@ -13,7 +13,7 @@ from sysid.islands.state import RunState
 from sysid.islands.stopping import count_restarts
 from sysid.minima.minima import FoundMinima
 from sysid.residuals.residual_tests import ResidualTests
-from sysid.results.result import SearchEvidence
+from sysid.results.parts import SearchEvidence
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
 
@@ -41,7 +41,6 @@ def assess_search(
         because,
         restarts.independent + found.projected,
         found.agreeing,
-        problem.free_names,
         found.minima,
     )
 

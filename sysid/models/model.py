@@ -64,6 +64,8 @@ class SelectedTerm(NamedTuple):
 
     Attributes
     ----------
+    term : str
+        The term.
     err : float
         Error-reduction ratio: the share of the output's sum of squares that this term explains
         in addition to the terms before it.
@@ -71,7 +73,8 @@ class SelectedTerm(NamedTuple):
         Share explained with all terms so far.
     coefficient : float
         Coefficient in the model of all selected terms, before the search. It comes from one-step
-        least squares, or from the free run if that selected the terms.
+        least squares, or from the free run if that selected the terms. Its unit follows from the
+        term.
     """
 
     term: str

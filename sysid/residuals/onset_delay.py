@@ -55,15 +55,23 @@ class OnsetDelay:
     Attributes
     ----------
     experiment : int
-        From 0.
+        Record, from 0.
+    input : str
+        Input of the model.
+    output : str
+        Output of the model.
     delay : float or None
-        Median over the events in s; None: see `reason`.
+        Median over the events, s; if there is none, `reason` says why.
     spread : float or None
-        Standard deviation over the events in s; None with fewer than two.
+        Standard deviation over the events, s; none with fewer than two.
     events : int
         Number of clear events among those examined.
     threshold : float or None
         Largest share of the excursion at which the output counted as moving.
+    reason : str
+        Why there is no delay; empty with one.
+    unit : str
+        Unit of delay and spread: s.
     """
 
     experiment: int
@@ -74,6 +82,7 @@ class OnsetDelay:
     events: int = 0
     threshold: float | None = None
     reason: str = ""
+    unit: str = "s"
 
 
 class _InputEvent(NamedTuple):

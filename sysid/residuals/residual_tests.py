@@ -69,27 +69,40 @@ class ResidualTest:
     Attributes
     ----------
     experiment : int
-        From 0.
+        Record, from 0.
+    output : str
+        Output whose residuals are tested.
+    test : {"whiteness", "independence"}
+        Whiteness: with their own past. Independence: with an input.
     input : str or None
-        None for whiteness.
+        Input of the test; none for whiteness.
     outcome : {"passed", "failed", "not tested"}
-        `reason` explains "not tested".
-    samples, lags : int
-        Scored samples; lags tested.
-    inside95, inside99 : float or None
-        Share of the tested lags inside the bands.
-    statistic, degrees, p : float or None
-        χ² statistic and degrees of freedom. `p` is the probability of a larger statistic for a
-        true model.
+        Outcome of the test.
+    samples : int
+        Scored residuals of the test.
+    lags_tested : int
+        Lags of the statistic.
+    inside95 : float or None
+        Share of the tested lags within the 95 % band.
+    inside99 : float or None
+        Share of the tested lags within the 99 % band.
+    statistic : float or None
+        Test statistic, χ² distributed if the model is true.
+    degrees : float or None
+        Degrees of freedom of the statistic.
+    p : float or None
+        Probability of a larger statistic if the model is true.
+    reason : str
+        Why it was not tested, or what failed.
     """
 
     experiment: int
     output: str
-    kind: ResidualTestKind
+    test: ResidualTestKind
     input: str | None
     outcome: ResidualTestOutcome
     samples: int
-    lags: int = 0
+    lags_tested: int = 0
     inside95: float | None = None
     inside99: float | None = None
     statistic: float | None = None
@@ -100,11 +113,24 @@ class ResidualTest:
 
 @dataclass(frozen=True, slots=True)
 class ResidualTests:
-    """All tests of a result; `passed` is None if nothing could be tested."""
+    """All tests of a result.
+
+    Attributes
+    ----------
+    data : {"estimation", "validation"}
+        Data of the residuals.
+    passed : bool or None
+        Whether all tests passed; none if nothing could be tested.
+    tests : tuple of ResidualTest
+        Each test.
+    level : float
+        Probability that a true model fails at least one of its tests.
+    """
 
     data: Literal["estimation", "validation"]
     passed: bool | None
     tests: tuple[ResidualTest, ...]
+    level: float = TEST_LEVEL
 
 
 @dataclass(frozen=True, slots=True, eq=False)

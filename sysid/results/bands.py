@@ -12,7 +12,7 @@ from sysid.core.settings import PredictionKind
 from sysid.data.records import Channels, Record, Recording
 from sysid.models.model import Model, name_initial_state, replace_substeps
 from sysid.models.parse import keep_terms
-from sysid.results.result import Identification
+from sysid.results.result import FullResult
 from sysid.simulation.metrics import ChannelMetrics
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import prepare_simulation
@@ -26,7 +26,7 @@ from sysid.uncertainty.output_bands import (
 
 
 def compute_bands(
-    found: Identification,
+    found: FullResult,
     inputs: Channels | Record | Recording | None = None,
     *,
     channels: Mapping[str, str] | None = None,
@@ -52,15 +52,15 @@ def compute_bands(
     model, record, _ = prepare_simulation(data.model, inputs, found, channels, times)
     starts = {name_initial_state(state.name, 0) for state in model.states}
     shared = {parameter.name for parameter in model.parameters} | starts
-    estimates = [estimate for estimate in found.estimates if estimate.name in shared]
-    noise = pool_noise(found.agreement, spread.noise_degrees)
+    estimates = [estimate for estimate in found.parameters if estimate.name in shared]
+    noise = pool_noise(found.agreement.estimation, spread.noise_degrees)
     compared = replace(record, outputs=tuple(_fill_missing(one) for one in record.outputs))
     [bands] = compute_fit_bands(model, [compared], estimates, data.ties, spread, noise)
     return bands
 
 
 def compute_record_bands(
-    found: Identification, spread: ParameterSpread | None = None
+    found: FullResult, spread: ParameterSpread | None = None
 ) -> tuple[tuple[OutputBands, ...], ...]:
     """Compute the bands on the records of a result; none without errors or records.
 
@@ -77,10 +77,10 @@ def compute_record_bands(
     return compute_fit_bands(
         model,
         list_whole_records(data.records, data.validation if data.is_part else ()),
-        found.estimates,
+        found.parameters,
         data.ties,
         spread,
-        estimate_noise(found.agreement, spread.noise_degrees),
+        estimate_noise(found.agreement.estimation, spread.noise_degrees),
         data.prediction,
     )
 
@@ -160,14 +160,14 @@ def pool_noise(agreement: Iterable[ChannelMetrics], degrees: float) -> NoiseDevi
     return {(0, name): float(np.sqrt(power[name] / max(samples[name], 1))) for name in power}
 
 
-def _read_spread(found: Identification) -> ParameterSpread | None:
-    if found.uncertainty is None:
+def _read_spread(found: FullResult) -> ParameterSpread | None:
+    if found.correlation is None or found.covariance is None:
         return None
     has_samples = found.posterior is not None and len(found.posterior.samples) > 0
     return ParameterSpread(
-        found.uncertainty.names,
-        found.uncertainty.covariance,
-        found.uncertainty.degrees,
+        found.correlation.names,
+        found.covariance,
+        found.degrees,
         float(found.criteria.samples - found.criteria.parameters),
         found.posterior.samples if found.posterior is not None and has_samples else None,
     )

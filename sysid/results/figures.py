@@ -1,40 +1,44 @@
 """Draw the figures of a result, and convert channels and correlations to the data of figures."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import inf
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Literal,
+    NamedTuple,
+    Protocol,
+    TypeAlias,
+    get_args,
+)
 
 import numpy as np
 
 from sysid.core.errors import InvalidSettings, suggest_name
 from sysid.core.lazy_names import load_library
 from sysid.core.settings import LossKind
-from sysid.core.text import find_shown_error
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.figures import plotly
 from sysid.figures.data import (
     BandTraces,
-    CornerParameter,
     CorrelationTrace,
     ExperimentTraces,
-    FreeParameter,
-    IslandImprovement,
     OutputTraces,
-    RunFigureData,
+    SearchTraces,
     SignalTrace,
 )
-from sysid.figures.plotly import Figure, apply_theme, empty_figure, has_points
+from sysid.figures.plotly import Abscissa, Figure, apply_theme, empty_figure, has_points
 from sysid.figures.posterior import plot_posterior
 from sysid.figures.residuals import plot_residuals
 from sysid.figures.signals import plot_response
 from sysid.figures.stack import stack_figures
 from sysid.figures.theme import Theme
+from sysid.models.parameters import Parameter, ParameterScale
 from sysid.residuals.residual_tests import CorrelationFunction
-from sysid.results.result import Identification
-from sysid.results.summary import find_output_unit
-from sysid.uncertainty.estimates import Estimate
+from sysid.results.result import FullResult, Result, find_output_unit
 
 if TYPE_CHECKING:
     from sysid.uncertainty.output_bands import OutputBands
@@ -45,11 +49,20 @@ FigureName = Literal[
 FIGURES: tuple[FigureName, ...] = get_args(FigureName)
 RecordTraces: TypeAlias = tuple[tuple[OutputTraces, ...], tuple[SignalTrace, ...]]
 """Outputs and inputs of a record."""
+TITLES: Mapping[FigureName, str] = {
+    "history": "Progress of every island",
+    "convergence": "Convergence of the parameters",
+    "response": "Measured against identified",
+    "residuals": "Correlation of the residuals",
+    "correlation": "Correlation of the estimates",
+    "waterfall": "What each island found",
+    "posterior": "Posterior",
+}
 _USUAL: tuple[FigureName, ...] = ("response", "residuals", "correlation", "waterfall")
 
 
 def plot_result(
-    found: Identification,
+    found: FullResult,
     names: Sequence[FigureName | Sequence[FigureName]],
     experiment: int,
     theme: Theme,
@@ -101,9 +114,12 @@ def _describe_missing_figure(name: FigureName) -> str:
 
 
 def draw_figures(
-    found: Identification, names: Sequence[FigureName], experiment: int = 0
+    found: FullResult, names: Sequence[FigureName], experiment: int = 0
 ) -> list[tuple[str, Figure]]:
     """Draw figures of a result that have data, each with its title.
+
+    `experiment` is one of the records, of which those of the validation data come last. Of
+    residuals the nearest tested record is drawn.
 
     Raises
     ------
@@ -115,91 +131,205 @@ def draw_figures(
         known = ", ".join(f"{i} ({one.name})" for i, one in enumerate(experiments))
         detail = f"found {experiment!r}; the records are {known}"
         raise InvalidSettings("/experiment", detail)
-    data = to_figure_data(found)
-    draw: dict[FigureName, Callable[[], tuple[str, Figure]]] = {
-        "history": lambda: ("Progress of every island", plotly.plot_history(data)),
-        "convergence": lambda: ("Convergence of the parameters", plotly.plot_convergence(data)),
-        "response": lambda: _draw_response(found, experiments, experiment),
-        "residuals": lambda: _draw_residuals(found, experiments, experiment),
-        "correlation": lambda: ("Correlation of the estimates", plotly.plot_correlation(data)),
-        "waterfall": lambda: ("What each island found", plotly.plot_waterfall(data)),
-        "posterior": lambda: ("Posterior", _draw_posterior(found)),
-    }
-    drawn = [draw[name]() for name in names]
+    source = ResultFigures(found)
+    tested = () if source.residuals is None else source.residuals.experiments
+    numbers = {"residuals": max(experiment - len(experiments) + len(tested), 0)}
+    recorded = {"response": [one.name for one in experiments], "residuals": tested}
+    drawn = []
+    for name in names:
+        number, listed = numbers.get(name, experiment), recorded.get(name, ())
+        title = TITLES[name] if len(listed) < 2 else f"{TITLES[name]}: {listed[number]}"
+        drawn.append((title, draw_run_figure(source, name, number)))
     return [(title, figure) for title, figure in drawn if has_points(figure)]
 
 
+@dataclass(frozen=True, slots=True)
+class FigureLook:
+    """How figures of a run are drawn.
+
+    Attributes
+    ----------
+    abscissa : {"generations", "evaluations"}
+        Of the history.
+    columns : int
+        Small plots in a row; 1 on a narrow page.
+    start, stop : float or None
+        Time window of the response, s.
+    """
+
+    abscissa: Abscissa = "generations"
+    columns: int = 3
+    start: float | None = None
+    stop: float | None = None
+
+
+class TestedResiduals(NamedTuple):
+    """Correlation functions of residuals, and the names of the experiments that were tested."""
+
+    correlations: Sequence[CorrelationFunction]
+    experiments: Sequence[str]
+
+
+class RunFigures(Protocol):
+    """What the figures of a run are drawn from, each part read when a figure needs it.
+
+    Until the run has a result it is None, there are no `experiments`, and no `residuals`.
+    """
+
+    @property
+    def result(self) -> Result | None:
+        """The result."""
+
+    @property
+    def search(self) -> SearchTraces:
+        """The search."""
+
+    @property
+    def experiments(self) -> Sequence[ExperimentTraces]:
+        """The records with outputs and bands."""
+
+    @property
+    def residuals(self) -> TestedResiduals | None:
+        """The residuals that were tested."""
+
+
+_DEFAULT_LOOK = FigureLook()
+
+
+def draw_run_figure(
+    run: RunFigures, name: FigureName, experiment: int = 0, look: FigureLook = _DEFAULT_LOOK
+) -> Figure:
+    """Draw a figure of a run; it is empty as long as the run has no data for it.
+
+    `experiment` is the number of the record, or of the tested record, from 0.
+    """
+    result = run.result
+    correlation = None if result is None else result.correlation
+    match name:
+        case "response":
+            return _draw_response(run.experiments, experiment, look)
+        case "residuals":
+            return _draw_residuals(run.residuals, experiment, min(look.columns, 2))
+        case "correlation":
+            return plotly.plot_correlation(correlation)
+        case "posterior":
+            posterior, estimates = (result.posterior, result.parameters) if result else (None, ())
+            return plot_posterior(posterior, estimates, correlation, is_narrow=look.columns == 1)
+        case "history":
+            return plotly.plot_history(run.search, look.abscissa)
+        case "convergence":
+            return plotly.plot_convergence(run.search, look.columns)
+        case "waterfall":
+            islands, search = () if result is None else result.islands, run.search
+            return plotly.plot_waterfall(islands, search.unit, search.fitness_label)
+
+
+def list_report_figures(
+    run: RunFigures, most_experiments: int, *, names_each: bool
+) -> list[tuple[str, Figure]]:
+    """Draw the figures of a report, each with its title.
+
+    A title names the record if there are several, or if it `names_each`.
+    """
+    tested = run.residuals
+    recorded: dict[FigureName, Sequence[str]] = {
+        "response": [experiment.name for experiment in run.experiments],
+        "residuals": () if tested is None else tested.experiments,
+    }
+    each = [
+        (
+            f"{TITLES[name]}: {listed[number]}" if names_each or len(listed) > 1 else TITLES[name],
+            draw_run_figure(run, name, number),
+        )
+        for name, listed in recorded.items()
+        for number in range(min(len(listed), most_experiments))
+    ]
+    first: tuple[FigureName, ...] = ("history",)
+    last: tuple[FigureName, ...] = ("convergence", "correlation", "posterior", "waterfall")
+    before, after = (
+        [(TITLES[name], draw_run_figure(run, name)) for name in names] for names in (first, last)
+    )
+    return [*before, *each, *after]
+
+
 def _draw_response(
-    found: Identification, experiments: Sequence[ExperimentTraces], number: int
-) -> tuple[str, Figure]:
-    from sysid.results.bands import compute_record_bands  # it imports the compiler
-
+    experiments: Sequence[ExperimentTraces], number: int, look: FigureLook
+) -> Figure:
     if not experiments:
-        return "Measured against identified", empty_figure()
-    title = "Measured against identified"
-    if len(experiments) > 1:
-        title += f": {experiments[number].name}"
-    return title, plot_response(add_bands(experiments, compute_record_bands(found))[number])
+        return empty_figure()
+    figure = plot_response(experiments[number], look.start, look.stop)
+    figure["layout"]["meta"]["experiments"] = [experiment.name for experiment in experiments]
+    return figure
 
 
-def _draw_residuals(
-    found: Identification, experiments: Sequence[ExperimentTraces], number: int
-) -> tuple[str, Figure]:
-    title = "Correlation of the residuals"
-    if found.data is None:
-        return title, empty_figure()
-    tested = found.data.validation or found.data.records
-    first = len(experiments) - len(tested)  # separate validation records come last
-    shown = max(number - first, 0)
+def _draw_residuals(tested: TestedResiduals | None, number: int, columns: int) -> Figure:
+    if tested is None:
+        return empty_figure()
     traces = [
         to_correlation_trace(function)
-        for function in found.data.correlations
-        if function.test.experiment == shown and function.values.size
+        for function in tested.correlations
+        if function.test.experiment == number and function.values.size
     ]
-    if len(tested) > 1:
-        title += f": {experiments[shown + first].name}"
-    return title, plot_residuals(traces)
+    return plot_residuals(traces, columns, tested.experiments)
 
 
-def _draw_posterior(found: Identification) -> Figure:
-    posterior, uncertainty = found.posterior, found.uncertainty
-    if posterior is None:
-        return empty_figure()
-    estimates = {estimate.name: estimate for estimate in found.estimates}
-    parameters = [
-        CornerParameter(
-            **{
-                name: getattr(estimates[parameter.name], name)
-                for name in ("name", "unit", "lower", "upper", "value", "stderr", "interval95")
-            },
-            posterior95=parameter.interval95,
-            samples=posterior.samples[:, column],
+@dataclass(frozen=True, eq=False)
+class ResultFigures:
+    """What the figures of a result in memory are drawn from; a `RunFigures`."""
+
+    result: FullResult
+
+    @cached_property
+    def search(self) -> SearchTraces:
+        """The search."""
+        found, data = self.result, self.result.data
+        scales = {} if data is None else {p.name: p.scale for p in data.model.parameters}
+        return SearchTraces(
+            unit=find_output_unit(found),
+            fitness_label=label_fitness("squares" if data is None else data.loss),
+            generations=found.generations,
+            parameters=list_searched_parameters(found, scales),
+            estimates={estimate.name: estimate for estimate in found.parameters},
+            history=found.history,
         )
-        for column, parameter in enumerate(posterior.parameters)
+
+    @cached_property
+    def experiments(self) -> Sequence[ExperimentTraces]:
+        """The records with outputs and bands; none without the fitted data."""
+        from sysid.results.bands import compute_record_bands  # it imports the compiler
+
+        experiments = list_experiments(self.result)
+        return add_bands(experiments, compute_record_bands(self.result)) if experiments else []
+
+    @cached_property
+    def residuals(self) -> TestedResiduals | None:
+        """The residuals that were tested; None without the fitted data."""
+        data = self.result.data
+        if data is None:
+            return None
+        names = [experiment.name for experiment in list_experiments(self.result)]
+        tested = data.validation or data.records
+        return TestedResiduals(data.correlations, names[len(names) - len(tested) :])
+
+
+def list_searched_parameters(
+    result: Result, scales: Mapping[str, ParameterScale]
+) -> list[Parameter]:
+    """List the free parameters of a result, in the order of the history's columns.
+
+    A bound at zero or below has no logarithm, so its axis is linear.
+    """
+    return [
+        Parameter(
+            estimate.name,
+            estimate.lower,
+            estimate.upper,
+            estimate.unit,
+            scales.get(estimate.name, "linear") if estimate.lower > 0 else "linear",
+        )
+        for estimate in result.parameters
+        if estimate.is_free
     ]
-    return plot_posterior(
-        parameters, np.array([]) if uncertainty is None else uncertainty.correlation
-    )
-
-
-def to_figure_data(found: Identification) -> RunFigureData:
-    """Convert search and estimates of a result to the data of their figures."""
-    uncertainty = found.uncertainty
-    return RunFigureData(
-        id="",
-        unit=find_output_unit(found),
-        fitness_label=label_fitness("squares" if found.data is None else found.data.loss),
-        generations=found.generations,
-        evaluations=found.evaluations,
-        parameters=[_to_free_parameter(found, one) for one in found.estimates if one.is_free],
-        history=[
-            [IslandImprovement(*improvement) for improvement in island] for island in found.history
-        ],
-        islands=[(island.champion_rms, island.refined_rms) for island in found.islands],
-        correlation=None
-        if uncertainty is None
-        else {"names": uncertainty.names, "matrix": uncertainty.correlation},
-    )
 
 
 def label_fitness(loss: LossKind) -> str:
@@ -207,20 +337,7 @@ def label_fitness(loss: LossKind) -> str:
     return "soft-l1 loss, as RMS" if loss == "soft-l1" else "RMS"
 
 
-def _to_free_parameter(found: Identification, estimate: Estimate) -> FreeParameter:
-    scales = {} if found.data is None else {p.name: p.scale for p in found.data.model.parameters}
-    return FreeParameter(
-        estimate.name,
-        estimate.unit,
-        estimate.lower,
-        estimate.upper,
-        scales.get(estimate.name, "linear"),
-        estimate.value,
-        find_shown_error(estimate.stderr, estimate.status),
-    )
-
-
-def list_experiments(found: Identification) -> list[ExperimentTraces]:
+def list_experiments(found: FullResult) -> list[ExperimentTraces]:
     """List the records with measured and identified outputs; none without the fitted data."""
     data = found.data
     if data is None:

@@ -8,14 +8,15 @@ from typing import Any
 from sysid.core.lazy_names import load_library
 from sysid.core.text import (
     DASH,
-    find_rms_unit,
     format_interval,
     join_estimate,
     plain_estimate,
     plain_unit,
 )
+from sysid.core.value_documents import list_fields
 from sysid.residuals.residual_tests import ResidualTests
-from sysid.results.result import Identification, OrderComparison, SearchEvidence
+from sysid.results.parts import OrderComparison, SearchEvidence
+from sysid.results.result import FullResult, find_output_unit
 from sysid.uncertainty.estimates import Estimate
 
 _MAX_WARNINGS = 3
@@ -26,9 +27,9 @@ _BECAUSE = {
 }
 
 
-def summarise_result(found: Identification) -> str:
+def summarise_result(result: FullResult) -> str:
     """Summarise a result in a few lines: estimates, fit, verdicts, the first warnings."""
-    lines = [", ".join(_list_facts(found)), f"verdict: {found.verdict.text}"]
+    lines = [", ".join(_list_facts(result)), f"verdict: {result.verdict.text}"]
     rows = [
         (
             estimate.name,
@@ -36,34 +37,34 @@ def summarise_result(found: Identification) -> str:
             "" if estimate.unit == "1" else estimate.unit,
             estimate.status,
         )
-        for estimate in found.estimates
+        for estimate in result.parameters
     ]
     lines += [f"  {'  '.join(cells).rstrip()}" for cells in _align_columns(rows)]
-    lines += _list_verdicts(found)
-    shown = found.warnings[:_MAX_WARNINGS]
+    lines += _list_verdicts(result)
+    shown = result.warnings[:_MAX_WARNINGS]
     lines += [f"note: {warning}" for warning in shown]
-    left = len(found.warnings) - len(shown)
+    left = len(result.warnings) - len(shown)
     if left > 0:
         lines.append(f"and {left} more in `warnings`")
     return "\n".join(lines)
 
 
-def to_html(found: Identification) -> str:
+def to_html(result: FullResult) -> str:
     """Write a result as HTML: estimates, fit, verdicts, all warnings."""
     head = "".join(
         f"<th style='text-align:left'>{name}</th>"
         for name in ("Parameter", "Estimate", "Unit", "95 % interval", "Status")
     )
-    rows = "".join(f"<tr>{_write_cells(estimate)}</tr>" for estimate in found.estimates)
+    rows = "".join(f"<tr>{_write_cells(estimate)}</tr>" for estimate in result.parameters)
     facts = "<br>".join(
         escape(text)
         for text in [
-            ", ".join(_list_facts(found)),
-            f"verdict: {found.verdict.text}",
-            *_list_verdicts(found),
+            ", ".join(_list_facts(result)),
+            f"verdict: {result.verdict.text}",
+            *_list_verdicts(result),
         ]
     )
-    warnings = "".join(f"<li>{escape(warning)}</li>" for warning in found.warnings)
+    warnings = "".join(f"<li>{escape(warning)}</li>" for warning in result.warnings)
     notes = f"<details open><summary>Warnings</summary><ul>{warnings}</ul></details>"
     return (
         f"<div><p>{facts}</p><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
@@ -71,7 +72,7 @@ def to_html(found: Identification) -> str:
     )
 
 
-def to_frame(found: Identification) -> Any:
+def to_frame(result: FullResult) -> Any:
     """Return the estimates as a table of pandas, indexed by the names of the parameters.
 
     Raises
@@ -80,31 +81,23 @@ def to_frame(found: Identification) -> Any:
         If pandas is not installed.
     """
     pandas = load_library("pandas", "to_pandas()")
-    unknown = float("nan")
-    rows = [
-        {
-            "value": estimate.value,
-            "stderr": unknown if estimate.stderr is None else estimate.stderr,
-            "low95": unknown if estimate.interval95 is None else estimate.interval95[0],
-            "high95": unknown if estimate.interval95 is None else estimate.interval95[1],
-            "unit": estimate.unit,
-            "status": estimate.status,
-            "lower": estimate.lower,
-            "upper": estimate.upper,
-            "reason": estimate.reason,
-        }
-        for estimate in found.estimates
-    ]
-    names = [estimate.name for estimate in found.estimates]
+    rows = [dict(_list_columns(estimate)) for estimate in result.parameters]
+    names = [estimate.name for estimate in result.parameters]
     return pandas.DataFrame(rows, index=pandas.Index(names, name="parameter"))
 
 
-def find_output_unit(found: Identification) -> str:
-    """Find the unit of the RMS of a result: that of its output, or σ for several together."""
-    return find_rms_unit(
-        {metrics.output: metrics.unit for metrics in found.agreement},
-        lambda _: "1" if found.data is None else found.data.records[0].outputs[0].unit,
-    )
+def _list_columns(estimate: Estimate) -> Iterator[tuple[str, object]]:
+    """List the columns of an estimate: its fields but for its name, the interval as two."""
+    unknown = float("nan")
+    yield "value", estimate.value
+    yield "stderr", unknown if estimate.stderr is None else estimate.stderr
+    low, high = (unknown, unknown) if estimate.interval95 is None else estimate.interval95
+    yield from (("low95", low), ("high95", high), ("unit", estimate.unit))
+    yield from (("status", estimate.status), ("lower", estimate.lower), ("upper", estimate.upper))
+    shown = {"name", "value", "stderr", "interval95", "unit", "status", "lower", "upper"}
+    for field in list_fields(Estimate):
+        if field.name not in shown:
+            yield field.name, getattr(estimate, field.name)
 
 
 def describe_residuals(tests: ResidualTests) -> str:
@@ -148,30 +141,30 @@ def describe_order(comparison: OrderComparison) -> str:
     return f"order: the data {verdict.format(others)}; {comparison.delay} is {delays}"
 
 
-def _list_facts(found: Identification) -> Iterator[str]:
-    if found.data is not None:
-        yield f"Identification of {found.data.model.name!r}"
+def _list_facts(result: FullResult) -> Iterator[str]:
+    if result.data is not None:
+        yield f"Identification of {result.data.model.name!r}"
     else:
         yield "Identification"
-    unit = plain_unit(find_output_unit(found))
-    yield f"fit {_format_fit(found.fit_percent)}"
-    yield f"RMS {found.rms:.4g}{unit}"
-    if found.rms_validation is not None and found.fit_percent_validation is not None:
-        yield f"validation fit {_format_fit(found.fit_percent_validation)}"
-        yield f"validation RMS {found.rms_validation:.4g}{unit}"
+    unit = plain_unit(find_output_unit(result))
+    yield f"fit {_format_fit(result.fit_percent.estimation)}"
+    yield f"RMS {result.rms:.4g}{unit}"
+    if result.rms_validation is not None and result.fit_percent.validation is not None:
+        yield f"validation fit {_format_fit(result.fit_percent.validation)}"
+        yield f"validation RMS {result.rms_validation:.4g}{unit}"
 
 
 def _format_fit(fit: float) -> str:
     return f"{fit:.2f} %" if isfinite(fit) else "undefined"
 
 
-def _list_verdicts(found: Identification) -> list[str]:
-    verdicts = [] if found.valid else ["the model is invalid: its RMS is above the safe limit"]
-    if found.residual_tests is not None and found.residual_tests.passed is not None:
-        verdicts.append(describe_residuals(found.residual_tests))
-    if found.order_comparison is not None:
-        verdicts.append(describe_order(found.order_comparison))
-    return [*verdicts, describe_search(found.search)]
+def _list_verdicts(result: FullResult) -> list[str]:
+    verdicts = [] if result.valid else ["the model is invalid: its RMS is above the safe limit"]
+    if result.residual_tests.passed is not None:
+        verdicts.append(describe_residuals(result.residual_tests))
+    if result.order_comparison is not None:
+        verdicts.append(describe_order(result.order_comparison))
+    return [*verdicts, describe_search(result.search)]
 
 
 def _align_columns(rows: Sequence[tuple[str, ...]]) -> Iterator[list[str]]:

@@ -13,7 +13,7 @@ from sysid.core.text import plain_estimate, plain_unit
 
 if TYPE_CHECKING:  # the client's types name `Trust`, and load no numerics
     from sysid.residuals.residual_tests import ResidualTest
-    from sysid.results.result import OrderComparison, SearchEvidence
+    from sysid.results.parts import OrderComparison, SearchEvidence
     from sysid.simulation.metrics import ChannelMetrics
     from sysid.uncertainty.estimates import Estimate
 
@@ -39,7 +39,7 @@ class Reason:
         Serious: do not rely on the estimates. Caution: they hold under a condition. Note: worth
         knowing.
     brief : str
-        A few words, as they follow "trustworthy, but" or "not trustworthy:".
+        A few words, as they follow “trustworthy, but” or “not trustworthy:”.
     text : str
         Whole sentences: what was found, and what helps.
     """
@@ -58,7 +58,7 @@ class Verdict:
     trust : {"trustworthy", "limited", "not trustworthy"}
         Limited: the estimates hold under the condition that the text names.
     text : str
-        The verdict in words, such as "trustworthy, but L depends on the model's order".
+        The verdict in words, such as “trustworthy, but L depends on the model's order”.
     reasons : tuple of Reason
         The most severe first; empty if nothing speaks against the result.
 
@@ -129,7 +129,7 @@ class Evidence:
     def has_failed(self, kind: str) -> bool:
         """Whether a residual test of this kind failed clearly: true models seldom do so."""
         return any(
-            test.kind == kind and test.outcome == "failed" and (test.p or 0.0) <= _UNLIKELY
+            test.test == kind and test.outcome == "failed" and (test.p or 0.0) <= _UNLIKELY
             for test in self.tests
         )
 

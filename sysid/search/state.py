@@ -35,6 +35,17 @@ class IslandSummary:
     """Champion of one island before and after refinement (for the waterfall plot).
 
     The two RMS are fitnesses: J of Eq. 10, or √(robust loss / n) with soft-l1.
+
+    Attributes
+    ----------
+    champion_rms : float
+        RMS error of the search, in the unit of the result's `rms`.
+    refined_rms : float or None
+        RMS error after least squares, in the same unit; none without.
+    parameters : tuple of float
+        Values of the free parameters, in their units.
+    evaluations : int
+        Simulations of the island.
     """
 
     champion_rms: float

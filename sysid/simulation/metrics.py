@@ -43,8 +43,25 @@ def compute_line_rms(x: FloatArray, y: FloatArray) -> float:
 class ChannelMetrics:
     """Agreement of one output of one experiment, over its scored samples.
 
-    `span` holds the least and the largest measured value. The estimate holds for such amplitudes.
-    `line_rms` is the RMS of a straight line through the samples, or ``nan`` for less than three.
+    Attributes
+    ----------
+    experiment : int
+        Record, from 0.
+    output : str
+        Output of the model.
+    unit : str
+        Unit of the RMS.
+    samples : int
+        Scored samples.
+    rms : float
+        RMS error, in `unit`.
+    fit_percent : float
+        Fit, %; not a number if the output does not vary.
+    span : tuple of float
+        Least and largest measured value, in `unit`. The estimate holds for such amplitudes.
+    line_rms : float
+        RMS error of a straight line through the samples, in `unit`; not a number for less than
+        three.
     """
 
     experiment: int

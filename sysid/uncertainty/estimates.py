@@ -1,6 +1,6 @@
 """Estimates: standard errors, intervals, statuses, information criteria, posterior."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 from typing import Literal
 
@@ -21,6 +21,7 @@ EstimateStatus = Literal[
     "unidentifiable",
     "fixed",
     "tied",
+    "unfinished",
 ]
 
 
@@ -30,10 +31,24 @@ class Estimate:
 
     Attributes
     ----------
+    name : str
+        Name of the parameter, or of an initial state such as ``x(0)``.
+    unit : str
+        Unit of its values.
+    value : float
+        Estimate, in `unit`.
+    lower : float
+        Lower bound of the search, in `unit`.
+    upper : float
+        Upper bound of the search, in `unit`.
     stderr : float or None
-        Standard error, in `unit`. If it is None, `reason` says why.
+        Standard error, in `unit`. If there is none, `reason` says why.
     interval95 : tuple of float or None
-        95 % interval by the t distribution.
+        Both ends of the 95 % interval by the t distribution, in `unit`.
+    status : EstimateStatus
+        Identified, or why the value is not to be relied on.
+    reason : str
+        Reason of the status, or of a missing standard error; empty if there is nothing to say.
 
     Examples
     --------
@@ -69,12 +84,16 @@ class Criteria:
 
     Attributes
     ----------
-    aic, bic : float
-        Minus infinity where the residuals vanish.
+    aic : float
+        Akaike's criterion; minus infinity where the residuals vanish.
     aicc : float or None
-        None if there are not more samples than κ + 1.
-    samples, parameters : int
-        n scored samples and D free parameters.
+        The same, corrected for few samples; missing if there are not more than κ + 1.
+    bic : float
+        Schwarz's criterion; minus infinity where the residuals vanish.
+    samples : int
+        Number n of scored samples.
+    parameters : int
+        Number D of free parameters.
     """
 
     aic: float
@@ -82,6 +101,22 @@ class Criteria:
     bic: float
     samples: int
     parameters: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CorrelationMatrix:
+    """Correlation matrix; its rows and columns are `names`.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Free parameters of the rows and columns.
+    matrix : FloatArray, shape (D, D)
+        Rows of the matrix.
+    """
+
+    names: tuple[str, ...]
+    matrix: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,8 +147,14 @@ class PosteriorParameter:
 
     Attributes
     ----------
+    name : str
+        Name of the parameter.
+    unit : str
+        Unit of its values.
+    median : float
+        Median, in `unit`.
     interval95 : tuple of float
-        The 2.5 and 97.5 % quantiles.
+        The 2.5 and 97.5 % quantiles, in `unit`.
     effective_samples : float
         Number of independent samples that would estimate the mean as well.
     """
@@ -134,14 +175,19 @@ class Posterior:
     parameters : tuple of PosteriorParameter
         The free parameters; empty without samples.
     samples : FloatArray, shape (m, D)
-        At most 1,000 of the samples, chosen at random.
-    correlation : FloatArray, shape (D, D)
-    walkers, steps : int
-        Steps include those that are left out.
+        At most 1,000 of the samples, chosen at random, in the parameters' units; not in lists.
+    correlation : CorrelationMatrix
+        Correlation of the samples.
+    walkers : int
+        Walkers of the chain.
+    steps : int
+        Steps of each walker, with those that are left out.
     acceptance : float
         Share of the proposed moves that were accepted.
     evaluations : int
-    is_converged : bool
+        Simulations of the chain.
+    converged : bool
+        Whether the chain has converged.
     reason : str
         Why the chain has not converged, or why there is none; empty if it has.
     gain : float
@@ -149,12 +195,12 @@ class Posterior:
     """
 
     parameters: tuple[PosteriorParameter, ...]
-    samples: FloatArray
-    correlation: FloatArray
+    samples: FloatArray = field(metadata={"digits": 8})
+    correlation: CorrelationMatrix
     walkers: int
     steps: int
     acceptance: float
     evaluations: int
-    is_converged: bool
+    converged: bool
     reason: str
     gain: float = 0.0

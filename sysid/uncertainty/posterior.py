@@ -28,7 +28,7 @@ from sysid.residuals.sandwich import CHI_SQUARE_95
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit, to_unit
 from sysid.uncertainty.analysis import Analysis
-from sysid.uncertainty.estimates import Estimate, Posterior, PosteriorParameter
+from sysid.uncertainty.estimates import CorrelationMatrix, Estimate, Posterior, PosteriorParameter
 from sysid.uncertainty.likelihood import Likelihood, LikelihoodModel
 
 _RANDOM_STREAM = 2**63 + 1
@@ -80,8 +80,8 @@ def sample_posterior(
 
 
 def _make_empty_posterior(d: int, reason: str, evaluations: int = 0) -> Posterior:
-    nothing = np.zeros((d, d))
-    return Posterior((), nothing[:0], nothing, 0, 0, 0.0, evaluations, False, reason)
+    none, no_correlation = np.zeros((0, d)), CorrelationMatrix((), np.zeros((0, 0)))
+    return Posterior((), none, no_correlation, 0, 0, 0.0, evaluations, False, reason)
 
 
 def describe_posterior(posterior: Posterior, estimates: Sequence[Estimate] = ()) -> list[str]:
@@ -89,7 +89,7 @@ def describe_posterior(posterior: Posterior, estimates: Sequence[Estimate] = ())
     if not posterior.parameters:
         return [f"no posterior was sampled: {posterior.reason}"]
     described = []
-    if not posterior.is_converged:
+    if not posterior.converged:
         described.append(
             f"the samples of the posterior have not converged: {posterior.reason}. Take their "
             "intervals as a rough indication"
@@ -107,7 +107,7 @@ def _describe_differences(posterior: Posterior, estimates: Sequence[Estimate]) -
     """Describe the parameters whose interval has another width than that of the samples."""
     by_name = {one.name: one for one in estimates if one.stderr and one.interval95 is not None}
     differences = []
-    for sampled in posterior.parameters if posterior.is_converged else ():
+    for sampled in posterior.parameters if posterior.converged else ():
         low, high = sampled.interval95
         if sampled.name in by_name and high > low:
             stated = by_name[sampled.name].interval95 or (0.0, 0.0)
@@ -225,7 +225,7 @@ class _Sampler:
                 for d, parameter in enumerate(self._problem.free_parameters)
             ),
             flat[np.sort(kept)],
-            _compute_correlation(flat),
+            CorrelationMatrix(self._problem.free_names, _compute_correlation(flat)),
             self._walkers,
             int(self._ensemble.iteration),
             float(np.mean(self._ensemble.acceptance_fraction)),

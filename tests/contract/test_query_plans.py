@@ -43,7 +43,7 @@ from service.repositories.datasets import DatasetRepository
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.repositories.lineage import LineageRepository
-from service.repositories.outcomes import read_parameters
+from service.repositories.outcomes import read_estimates
 from service.repositories.references import ReferenceRepository
 from service.repositories.results import list_results
 from service.repositories.runs import RunRepository
@@ -68,7 +68,7 @@ from service.storage.tables import (
 )
 from service.upkeep.retention import list_deleted_jobs, list_ended_jobs
 from tests.database import record_statements
-from tests.results import conclude, encode_results
+from tests.results import conclude, encode_results, write_result
 from tests.stored import claimed, new_dataset, new_job, new_run
 
 N_JOBS, N_RUNS, N_EVENTS, N_OTHERS = 3000, 2000, 3000, 2000
@@ -141,6 +141,7 @@ def filled(request: pytest.FixtureRequest) -> Filled:
             number="s.n + 2",
             state="'succeeded'",
             best_rms="1.0 + s.n",
+            result=f"'{json.dumps(write_result())}'",
             spec_hash=pad(f"h{number}", database),
             signals_sha256=pad(f"a{number}", database),
         )
@@ -280,7 +281,7 @@ def show_results(at: Filled) -> None:
             assert len(jobs.list_page(order=order, limit=20, cursor=page.next).items) == 20
         rows = list_results(session, limit=5).items
         list_results(session, limit=5, cursor=f"{LARGE}:7", only_best=True)
-        read_parameters(session, [row.run for row in rows])
+        read_estimates(session, [row.run for row in rows])
         lineage = LineageRepository(session)
         lineage.list_links_to_children(["ds_1"], 17)
         lineage.list_links_to_parents(["job_1"], 17)

@@ -11,14 +11,19 @@ from service.repositories.references import ReferenceRepository
 from service.repositories.trends import read_trend_rows
 from service.storage.errors import RowNotFound
 from service.storage.tables import Run
+from sysid.core.value_documents import encode
+from sysid.residuals.onset_delay import OnsetDelay
+from sysid.results.result import Agreements
+from tests.results import build_estimate, write_result
 from tests.stored import claimed, new_run, runs_of, submit
 
-RESULT = {
-    "parameters": [{"name": "L", "value": 0.1, "stderr": 0.25, "status": "identified"}],
-    "onset_delays": [{"input": "u", "output": "y", "delay": 0.5}],
-    "agreement": {"estimation": [{"output": "y", "span": [0.0, 1.5]}]},
-    "warnings": ["T and L not separable"],
-}
+WARNINGS = ["T and L not separable"]
+ONSETS = (OnsetDelay(0, "u", "y", 0.5),)
+RESULT = write_result(
+    parameters=[encode(build_estimate("L", 0.1, 0.25))],
+    onset_delays=encode(ONSETS),
+    warnings=WARNINGS,
+)
 
 
 def accepted(database, name, run, **more):
@@ -117,5 +122,7 @@ def test_a_trend_reads_the_runs_that_succeeded_in_order_with_parts_of_their_resu
         first, last = read_trend_rows(session, lease.job_id, 10)
         assert [one.id for one in read_trend_rows(session, lease.job_id, 1)] == runs[:1]
     assert (first.id, first.labels, first.evaluations) == (runs[0], {"length_m": 0.0}, 7)
-    assert {name: getattr(first, name) for name in RESULT} == RESULT
-    assert (last.id, last.warnings) == (runs[2], [])
+    assert first.parameters == (build_estimate("L", 0.1, 0.25),)
+    assert (first.onset_delays, first.warnings) == (ONSETS, tuple(WARNINGS))
+    assert (first.agreement, first.noise_model) == (Agreements((), ()), "white")
+    assert (last.id, last.warnings) == (runs[2], ())

@@ -3,6 +3,7 @@
 import pytest
 
 from service.core.states import JobState
+from service.jobs.results import write_result_document
 from service.queue.leases import Claim, LeaseQueue
 from service.queue.reuse import find_computed_runs, take_over_runs
 from service.queue.run_writes import RunOutcome, RunWriter
@@ -21,6 +22,7 @@ from service.repositories.trends import read_trend_rows
 from service.storage.errors import RowNotFound
 from service.storage.sessions import SessionOwner, find_database
 from service.storage.tables import DEFAULT_PROJECT, Project
+from tests.results import conclude
 from tests.stored import job_of, new_dataset, new_job, new_run
 
 OTHER = "proj_other"
@@ -52,7 +54,7 @@ def claimed(database, project: str) -> tuple[Claim, str]:
 def computed(database, project: str, rms: float = 0.5) -> tuple[Claim, str]:
     """The same with a result."""
     got, run = claimed(database, project)
-    result = {"parameters": [{"name": "L", "value": rms, "stderr": None}]}
+    result = write_result_document(conclude(rms, L=(rms, None)).identification, 1.0)
     with database.write_session() as session:
         RunWriter(session, got.lease).record_outcomes(
             [

@@ -31,6 +31,7 @@ from service.storage.sessions import Database
 from sysid.data.records import Channel, Recording
 from tests.database import migrated_sqlite
 from tests.rest import settings_of
+from tests.results import write_result
 
 MODEL = {
     "name": "lagged-tube",
@@ -231,8 +232,7 @@ def _result(rms: float = SIGMA) -> dict[str, Any]:
     stderr = {"K": 0.00007, "T": 0.00041, "L": 0.00023}
     bounds = MODEL["parameters"]
     assert isinstance(bounds, dict)
-    return {
-        "valid": True,
+    parts = {
         "rms": rms,
         "rms_validation": None,
         "fit_percent": {"estimation": 98.1, "validation": None},
@@ -253,7 +253,12 @@ def _result(rms: float = SIGMA) -> dict[str, Any]:
             for name, value in TRUE.items()
         ],
         "islands": [
-            {"champion_rms": rms * (1 + 0.2 * i), "refined_rms": rms * (1 + 0.02 * i**3)}
+            {
+                "champion_rms": rms * (1 + 0.2 * i),
+                "refined_rms": rms * (1 + 0.02 * i**3),
+                "parameters": list(TRUE.values()),
+                "evaluations": 5000,
+            }
             for i in range(4)
         ],
         "correlation": {
@@ -300,6 +305,7 @@ def _result(rms: float = SIGMA) -> dict[str, Any]:
         "verdict": {"trust": "trustworthy", "text": "trustworthy", "reasons": []},
         "warnings": ["T and L have the correlation −0.78: T + L is better known than either"],
     }
+    return write_result(**parts)
 
 
 def _posterior(stderr: dict[str, float]) -> dict[str, Any]:
@@ -311,6 +317,11 @@ def _posterior(stderr: dict[str, float]) -> dict[str, Any]:
     return {
         "converged": True,
         "reason": "",
+        "walkers": 8,
+        "steps": 2000,
+        "acceptance": 0.41,
+        "evaluations": 16_000,
+        "correlation": {"names": list(TRUE), "matrix": np.corrcoef(values).tolist()},
         "parameters": [
             {
                 "name": name,

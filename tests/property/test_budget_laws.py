@@ -77,5 +77,5 @@ def test_of_a_budget_that_leaves_none_for_standard_errors_it_is_said_why_there_a
     algorithm = GeneticAlgorithm(stop=Stop(evaluations=50))
     found = identify(LAG, record(), algorithm, parameters=BOUNDS)
     assert found.evaluations <= 50
-    assert all(one.stderr is None for one in found.estimates)
-    assert all("the budget of simulations" in one.reason for one in found.estimates)
+    assert all(one.stderr is None for one in found.parameters)
+    assert all("the budget of simulations" in one.reason for one in found.parameters)

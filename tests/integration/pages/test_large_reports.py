@@ -21,6 +21,7 @@ from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
 from tests.rest import parts_of, recording, settings_of, store_csv
+from tests.results import write_result
 
 N_SIGMA, N_SEEDS = 40, 105  # times the two methods: 8,400 asked for, the first 2,000 of them made
 WHY = "the model diverged <everywhere>"
@@ -100,13 +101,7 @@ def _outcome(run: str, number: int) -> RunOutcome:
         evaluations=100,
         generations=4,
         seconds=0.01,
-        result={
-            "valid": True,
-            "rms": rms,
-            "parameters": values,
-            "verdict": {"trust": "trustworthy", "text": "trustworthy", "reasons": []},
-            "warnings": [],
-        },
+        result=write_result(rms=rms, parameters=values),
     )
 
 

@@ -14,7 +14,10 @@ from service.api import examples
 from service.api.app import create_app
 from service.api.openapi import list_operations
 from service.api.write_contract import DOCUMENT_FILE, TYPES_FILE, write_document, write_types
-from service.runs.result_schemas import EstimateOut
+from service.core.value_schemas import describe_value
+from sysid.core.value_documents import list_fields
+from sysid.results.result import Result
+from sysid.uncertainty.estimates import Estimate
 from tests.identified import carried_out
 from tests.repository import ROOT
 from tests.rest import parts_of, refused, settings_of
@@ -162,9 +165,9 @@ def check_answer(document: dict[str, Any], operation: dict[str, Any], answer: An
 def test_a_result_has_exactly_the_documented_fields(world: World) -> None:
     run = world.server.get(f"/v1/runs/{world.names[examples.RUN]}").json()
     schemas = world.document["components"]["schemas"]
-    parts = {"parameters": "EstimateOut", "search": "SearchOut", "criteria": "CriteriaOut"}
+    parts = {"parameters": "EstimateOut", "search": "SearchEvidenceOut", "criteria": "CriteriaOut"}
     parts |= {"agreement": "AgreementsOut", "identifiability": "IdentifiabilityOut"}
-    parts |= {"residual_tests": "ResidualVerdictOut", "islands": "IslandOut"}
+    parts |= {"residual_tests": "ResidualTestsOut", "islands": "IslandSummaryOut"}
     parts |= {"onset_delays": "OnsetDelayOut", "input_hold": "InputHoldOut"}
     for field, name in parts.items():
         values = run[field] if isinstance(run[field], list) else [run[field]]
@@ -172,7 +175,8 @@ def test_a_result_has_exactly_the_documented_fields(world: World) -> None:
         for value in values:
             assert set(value) == set(schemas[name]["properties"]), field
     assert set(run) == set(schemas["RunOut"]["properties"])
-    assert EstimateOut.model_validate(run["parameters"][0]).status
+    assert describe_value(Estimate).model_validate(run["parameters"][0])
+    assert {field.name for field in list_fields(Result)} <= set(run)
 
 
 def test_every_field_and_parameter_has_a_description(world: World) -> None:

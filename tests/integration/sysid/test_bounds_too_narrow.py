@@ -7,7 +7,7 @@ from sysid.core.settings import GeneticAlgorithm
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.simulation.simulate import simulate
 
 QUICK = GeneticAlgorithm(population=60, generations=40, islands=2)
@@ -35,7 +35,7 @@ def fitted(offset: float, y0: dict[str, float] | None = None) -> Identification:
 @pytest.mark.parametrize("offset", [40.0, 101_325.0, -3e6])
 def test_an_offset_outside_its_bounds_is_at_bound_and_is_the_one_to_widen(offset: float) -> None:
     found = fitted(offset)
-    y0 = next(one for one in found.estimates if one.name == "y0")
+    y0 = next(one for one in found.parameters if one.name == "y0")
     assert y0.status == "at bound"
     side, cure, bound = ("upper", "raise", 10) if offset > 0 else ("lower", "lower", -10)
     assert found.warnings[0].startswith(f"y0 is at its {side} bound {bound}")
@@ -46,5 +46,5 @@ def test_an_offset_outside_its_bounds_is_at_bound_and_is_the_one_to_widen(offset
 def test_with_bounds_that_are_wide_enough_nothing_is_said_of_them() -> None:
     found = fitted(40.0, {"lower": 0, "upper": 100})
     assert not any("To widen" in one for one in found.warnings)
-    values = {one.name: one.value for one in found.estimates}
+    values = {one.name: one.value for one in found.parameters}
     assert values["y0"] == pytest.approx(40.0, abs=0.05)

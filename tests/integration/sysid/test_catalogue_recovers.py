@@ -7,7 +7,7 @@ from sysid.data.records import Record
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import catalogue, load_model
 from sysid.models.model import Model
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from tests.catalogue_cases import CASES, Case, made
 
 
@@ -35,10 +35,10 @@ def test_the_parameters_that_made_a_record_are_found_again(name: str) -> None:
     found = search(model, made(model, case), case)
     spans = {parameter.name: parameter.upper - parameter.lower for parameter in model.parameters}
     free = {p.name for p in model.parameters if p.is_free}
-    statuses = {one.name: one.status for one in found.estimates if one.name in free}
+    statuses = {one.name: one.status for one in found.parameters if one.name in free}
     assert statuses == dict.fromkeys(free, "identified") | dict(case.statuses)
-    for one in found.estimates:
+    for one in found.parameters:
         if one.name in case.truth:
             truth = case.truth[one.name]
             room = case.within * (abs(truth) or spans[one.name])
-            assert one.value == pytest.approx(truth, abs=room), found.estimates
+            assert one.value == pytest.approx(truth, abs=room), found.parameters

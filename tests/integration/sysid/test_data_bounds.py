@@ -30,7 +30,7 @@ def test_a_warm_plant_is_found_without_an_option(seed: int) -> None:
     times = np.arange(float(u.size))
     record = Record((Channel("u", times, u, "%"),), (Channel("y", times, y, "degC"),))
     found = identify(load_model("sopdt"), record, seed=seed)
-    estimates = {estimate.name: estimate for estimate in found.estimates}
+    estimates = {estimate.name: estimate for estimate in found.parameters}
     truth = {"K": 0.8, "T1": 40.0, "r": 15 / 40, "L": 12.0, "y0": 20.0}
     for name, value in truth.items():
         stderr = estimates[name].stderr
@@ -46,7 +46,7 @@ def test_units_do_not_matter(gain: float, offset: float) -> None:
     times = 0.01 * np.arange(u.size)
     y = offset + respond(u, 12, (30.0,), gain) + noise
     record = Record((Channel("u", times, u),), (Channel("y", times, y),))
-    values = {e.name: e.value for e in identify(load_model("fopdt"), record).estimates}
+    values = {e.name: e.value for e in identify(load_model("fopdt"), record).parameters}
     assert values["K"] == pytest.approx(gain, rel=0.01)
     assert values["T"] == pytest.approx(0.3, rel=0.02)
     assert values["L"] == pytest.approx(0.12, abs=2e-3)

@@ -445,7 +445,7 @@ def test_an_identification_is_exported_with_its_uncertainty() -> None:
     # The tube starts where it was measured, so that is to be given.
     expected = simulated(
         model,
-        {one.name: one.value for one in found.estimates} | {"y(0)": y[0]},
+        {one.name: one.value for one in found.parameters} | {"y(0)": y[0]},
         times,
         {"u": u},
         "zero",

@@ -79,7 +79,7 @@ def test_intervals_of_a_lag_cover_it() -> None:
         data = record(u, exact(u, lag) + rng.normal(0, 0.01, u.size))
         bounds: dict[str, Any] = {"T": {"upper": 20.0}, "L": {"upper": 10.0}}
         found = identify(load_model("fopdt"), [data], parameters=bounds, seed=seed)
-        (estimate,) = (one for one in found.estimates if one.name == "L")
+        (estimate,) = (one for one in found.parameters if one.name == "L")
         assert estimate.interval95 is not None
         if not estimate.interval95[0] <= lag <= estimate.interval95[1]:
             missed.append((lag, estimate.value, estimate.stderr))

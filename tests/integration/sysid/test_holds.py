@@ -12,7 +12,8 @@ from sysid.data.records import Channel, Hold, Recording
 from sysid.identification.fit_problems import prepare_records
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
-from sysid.results.result import Identification, InputHold
+from sysid.results.identification import Identification
+from sysid.results.parts import InputHold
 
 PERIOD, LAG = 0.5, 3.2
 
@@ -37,7 +38,7 @@ def fitted(recording: Recording, hold: Mapping[str, Hold] | None = None) -> Iden
 
 
 def lag(found: Identification) -> float:
-    return next(one.value for one in found.estimates if one.name == "L")
+    return next(one.value for one in found.parameters if one.name == "L")
 
 
 def test_a_held_input_gives_the_true_lag_of_a_step_test() -> None:
@@ -46,7 +47,7 @@ def test_a_held_input_gives_the_true_lag_of_a_step_test() -> None:
 
 def test_a_step_is_held_without_being_told() -> None:
     found = fitted(step_test())
-    (hold,) = found.input_holds
+    (hold,) = found.input_hold
     assert lag(found) == pytest.approx(LAG, abs=0.02)
     assert (hold.input, hold.chosen, hold.other) == ("u", "zero", "first")
     assert hold.reason == "has two levels"
@@ -55,7 +56,7 @@ def test_a_step_is_held_without_being_told() -> None:
 def test_the_estimate_of_the_other_reading_is_told() -> None:
     recording = step_test(noise=0.01)
     found, lines = fitted(recording), fitted(recording.replace_holds({"u": "first"}))
-    (hold,) = found.input_holds
+    (hold,) = found.input_hold
     assert hold.estimates_other is not None
     assert hold.estimates_other["L"] == pytest.approx(lag(lines), abs=1e-4)
     assert hold.rms_other == pytest.approx(lines.rms, rel=1e-3)
@@ -65,14 +66,14 @@ def test_the_estimate_of_the_other_reading_is_told() -> None:
     assert found.evaluations > lines.evaluations
     same = fitted(recording, {"u": "first"})
     assert same.parameter_values == lines.parameter_values
-    assert same.input_holds == lines.input_holds
+    assert same.input_hold == lines.input_hold
 
 
 @pytest.mark.parametrize("hold", ["zero", "first"])
 def test_of_a_given_hold_nothing_is_told(hold: Hold) -> None:
     found = fitted(step_test().replace_holds({"u": hold}))
     assert not any("hold" in one for one in found.warnings)
-    assert found.input_holds == (InputHold("u", hold, None),)
+    assert found.input_hold == (InputHold("u", hold, None),)
 
 
 def test_a_budget_is_kept() -> None:
@@ -97,7 +98,7 @@ def moving_test() -> Recording:
 
 def test_a_reading_that_fits_worse_than_the_other_is_told() -> None:
     found = fitted(moving_test())
-    assert found.input_holds[0].chosen == "first"
+    assert found.input_hold[0].chosen == "first"
     assert any("(hold={'u': 'zero'})" in one and "fits better" in one for one in found.warnings)
     assert found["L"].status == "hold-dependent"
     assert "if u is read held" in found["L"].reason
@@ -120,7 +121,7 @@ def run_plant(seed: int, gain: float) -> Recording:
 
 def test_the_command_of_a_loop_may_be_held_and_the_lag_depends_on_it() -> None:
     found = fitted(run_plant(1, 0.8))
-    (hold,) = found.input_holds
+    (hold,) = found.input_hold
     assert (hold.chosen, found["L"].status) == ("first", "hold-dependent")
     assert any("as a command does" in one for one in found.warnings)
     assert found.verdict.trust == "limited"
@@ -145,8 +146,8 @@ def test_a_smooth_input_of_an_open_loop_is_read_as_lines_without_a_word() -> Non
     y = 1.5 * np.imag(slow * np.exp(0.15j * times))
     y += 0.02 * np.random.default_rng(1).standard_normal(400)
     found = fitted(Recording((Channel("u", times, u, "V"), Channel("y", times, y, "bar"))))
-    assert found.input_holds[0].chosen == "first"
-    assert "hold-dependent" not in [one.status for one in found.estimates]
+    assert found.input_hold[0].chosen == "first"
+    assert "hold-dependent" not in [one.status for one in found.parameters]
     assert not any("hold=" in one for one in found.warnings)
 
 
@@ -168,7 +169,7 @@ def test_jumps_between_irregular_samples_are_uncertain() -> None:
     measured = np.interp(times, fine, x) + 1e-3 * rng.standard_normal(200)
     record = (Channel("u", times, drive(times), "V"), Channel("y", times, measured, "bar"))
     found = fitted(Recording(record))
-    assert found.input_holds[0].chosen == "zero"
+    assert found.input_hold[0].chosen == "zero"
     (told,) = [one for one in found.warnings if "sampled irregularly" in one]
     period = float(told.split(", ")[-1].removesuffix(" s"))
     assert 0.4 < period < 0.9

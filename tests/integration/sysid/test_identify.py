@@ -10,7 +10,7 @@ from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
 from sysid.islands.state import RunState
 from sysid.models.catalogue.load import load_model
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.search.refine import refine_candidates
 from tests.searching import COULOMB, DUFFING, clean, example, noisy, record
 
@@ -19,7 +19,7 @@ COULOMB_MODEL = load_model("coulomb-eq16")
 
 
 def values(found: Identification) -> dict[str, float]:
-    return {estimate.name: estimate.value for estimate in found.estimates}
+    return {estimate.name: estimate.value for estimate in found.parameters}
 
 
 @pytest.mark.parametrize(("model", "truth"), [("duffing-eq16", DUFFING), ("coulomb-eq16", COULOMB)])
@@ -27,7 +27,7 @@ def test_the_truth_is_recovered_without_noise(model: str, truth: dict[str, float
     found = identify(load_model(model), record(clean(model)))
     assert values(found) == pytest.approx(truth, abs=1e-6)
     assert found.rms < 1e-7
-    assert found.fit_percent > 99.999
+    assert found.fit_percent.estimation > 99.999
 
 
 @pytest.mark.parametrize("model", ["duffing-eq16", "coulomb-eq16"])
@@ -50,7 +50,7 @@ def test_a_result_repeats_bit_for_bit() -> None:
     def once() -> Identification:
         return identify(DUFFING_MODEL, record(noisy()), seed=4)
 
-    assert once().estimates == once().estimates
+    assert once().parameters == once().parameters
     assert once().history == once().history
 
 
@@ -62,7 +62,7 @@ def test_the_methods_of_the_paper_are_reported_as_found() -> None:
         assert tuple(values(found).values()) == best.parameters
         assert found.islands[0].refined_rms is None
         assert any("not a local optimum" in warning for warning in found.warnings)
-        assert all(estimate.stderr is not None for estimate in found.estimates)
+        assert all(estimate.stderr is not None for estimate in found.parameters)
 
 
 def test_refinement_is_in_history_islands_and_count() -> None:
@@ -78,9 +78,9 @@ def test_refinement_is_in_history_islands_and_count() -> None:
 def test_validation_data_are_judged_but_not_fitted() -> None:
     alone = identify(DUFFING_MODEL, record(noisy()))
     found = identify(DUFFING_MODEL, record(noisy()), validation=record(noisy(seed=8)))
-    assert found.estimates == alone.estimates
+    assert found.parameters == alone.parameters
     assert found.rms_validation == pytest.approx(0.01, rel=0.2)
-    assert found.fit_percent_validation is not None
+    assert found.fit_percent.validation is not None
     assert found.simulated_validation[0][0].shape == (300,)
     assert alone.rms_validation is None
 
@@ -89,7 +89,7 @@ def test_several_records_are_fitted_jointly() -> None:
     both = [record(noisy(seed=1)), record(noisy(seed=2))]
     found, single = identify(DUFFING_MODEL, both), identify(DUFFING_MODEL, both[0])
     assert [len(experiment) for experiment in found.simulated] == [1, 1]
-    for two, one in zip(found.estimates, single.estimates, strict=True):
+    for two, one in zip(found.parameters, single.parameters, strict=True):
         assert two.stderr is not None
         assert one.stderr is not None
         assert two.stderr == pytest.approx(one.stderr / np.sqrt(2), rel=0.25)

@@ -14,7 +14,7 @@ from sysid.identification.run import begin_run
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.selection.starts import find_equation_error_starts
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
@@ -45,7 +45,7 @@ def narx_record(dh: float, dk: float, noise: float = 0.0, samples: int = 500) ->
 
 
 def values(found: Identification) -> dict[str, float]:
-    return {one.name: one.value for one in found.estimates}
+    return {one.name: one.value for one in found.parameters}
 
 
 def problem(record: Record, **fields: Any) -> Problem:
@@ -77,7 +77,7 @@ def test_with_measurement_noise_they_are_recovered_within_their_errors() -> None
     assert found.rms == pytest.approx(0.05, rel=0.1)
     far = [
         one.name
-        for one in found.estimates
+        for one in found.parameters
         if one.stderr is None or abs(one.value - truth[one.name]) > 4 * one.stderr
     ]
     assert far == []
@@ -217,7 +217,7 @@ def test_a_start_that_is_the_optimum_already_is_found_and_told(seed: int, island
     algorithm = GeneticAlgorithm(islands=islands, generations=30)
     found = identify(model, [record], algorithm, seed=seed, prediction="one-step")
     assert all(history and history[0].phase == "start" for history in found.history)
-    values = [one.value for one in found.estimates[:3]]
+    values = [one.value for one in found.parameters[:3]]
     np.testing.assert_allclose(values, [0.6, -0.2, 0.5], atol=0.02)
 
 
@@ -238,8 +238,8 @@ def test_one_step_ahead_it_is_least_squares_behind_the_samples_it_starts_from(lo
     rows = np.column_stack([y[late - 1], y[late - longest], u[late - 1]])
     solution, (squares,), *_ = np.linalg.lstsq(rows, y[late])
     errors = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows)) * squares / (n - longest - 3))
-    assert [one.value for one in found.estimates] == pytest.approx(solution, abs=1e-6)
-    assert [one.stderr for one in found.estimates] == pytest.approx(errors, rel=1e-4)
+    assert [one.value for one in found.parameters] == pytest.approx(solution, abs=1e-6)
+    assert [one.stderr for one in found.parameters] == pytest.approx(errors, rel=1e-4)
     assert found.rms == pytest.approx(np.sqrt(squares / (n - longest)), rel=1e-6)
     assert found.criteria is not None
     assert found.criteria.samples == n - longest

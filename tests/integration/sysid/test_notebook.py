@@ -38,10 +38,11 @@ from sysid.core.errors import (
 from sysid.models.model import Model, replace_substeps
 from sysid.residuals.residual_tests import judge_tests
 from sysid.results.figures import FIGURES, draw_figures, list_experiments
-from sysid.results.result import InputHold
+from sysid.results.parts import InputHold
+from sysid.results.result import FitPercent
 from sysid.results.saved_result import FORMAT
 from sysid.results.summary import summarise_result
-from sysid.uncertainty.estimates import Posterior
+from sysid.uncertainty.estimates import CorrelationMatrix, Posterior
 from tests.polynomials import TRUTH as POLYNOMIAL
 from tests.polynomials import document, frols, record_of
 
@@ -53,7 +54,8 @@ QUICK = GeneticAlgorithm(population=32, generations=60)
 FEW = {"y0": 20.0, "K": (0.1, 2.0), "T": (1.0, 20.0), "L": (0.0, 10.0), "x(0)": 0.0}
 
 
-NO_SAMPLES = Posterior((), np.zeros((0, 3)), np.zeros((0, 0)), 0, 0, 0.0, 0, False, "no budget")
+NO_CORRELATION = CorrelationMatrix((), np.zeros((0, 0)))
+NO_SAMPLES = Posterior((), np.zeros((0, 3)), NO_CORRELATION, 0, 0, 0.0, 0, False, "no budget")
 
 
 def make_frame() -> pd.DataFrame:
@@ -135,10 +137,12 @@ def test_a_result_is_a_few_lines(found: Identification) -> None:
     text = repr(found)
     head, verdict, *rows = text.splitlines()
     assert verdict == f"verdict: {found.verdict.text}"
-    assert head.startswith(f"Identification of 'fopdt', fit {found.fit_percent:.2f} %, RMS 0.1")
+    assert head.startswith(
+        f"Identification of 'fopdt', fit {found.fit_percent.estimation:.2f} %, RMS 0.1"
+    )
     assert "°C, validation fit" in head
     assert rows[0].split()[:3] == ["K", *summarise_estimate(found, "K")]
-    assert all(f"  {estimate.name}" in text for estimate in found.estimates)
+    assert all(f"  {estimate.name}" in text for estimate in found.parameters)
     assert "residuals on validation data: " in text
     assert len(text) < 1500
     many = replace(found, warnings=tuple(f"number {n} " + "x" * 500 for n in range(9)))
@@ -161,15 +165,15 @@ def test_the_html_of_a_result_is_complete_and_escaped(found: Identification) -> 
     html = evil._repr_html_()
     assert "<script>" not in html
     assert "&lt;script&gt;" in html
-    for estimate in found.estimates:
+    for estimate in found.parameters:
         assert f"<b>{estimate.name}</b>" in html
     assert html.count("<li>") == len(evil.warnings)
     assert "residuals on validation data" in html
 
 
 def test_an_estimate_has_its_name(found: Identification) -> None:
-    assert found["T"] is found.estimates[1]
-    assert list(found) == [estimate.name for estimate in found.estimates]
+    assert found["T"] is found.parameters[1]
+    assert list(found) == [estimate.name for estimate in found.parameters]
     assert "T" in found
     assert "TT" not in found
     assert found.parameter_values["T"] == found["T"].value
@@ -181,7 +185,7 @@ def test_an_estimate_has_its_name(found: Identification) -> None:
 
 def test_estimates_are_a_table_of_pandas(found: Identification) -> None:
     table = found.to_pandas()
-    assert list(table.index) == [estimate.name for estimate in found.estimates]
+    assert list(table.index) == [estimate.name for estimate in found.parameters]
     assert table.loc["L", "value"] == found["L"].value
     assert table.loc["L", "low95"] == found["L"].interval95[0]
     assert np.isnan(table.loc["y0", "stderr"])
@@ -205,8 +209,13 @@ def test_a_result_is_saved_and_read_bit_for_bit(
 
 
 def test_numbers_that_json_lacks_are_saved(found: Identification, tmp_path: Path) -> None:
-    odd = replace(found, rms=float("inf"), fit_percent=float("nan"), simulated=((np.zeros(0),),))
-    odd = replace(odd, posterior=NO_SAMPLES, uncertainty=None, data=None)
+    odd = replace(
+        found,
+        rms=float("inf"),
+        fit_percent=FitPercent(float("nan"), None),
+        simulated=((np.zeros(0),),),
+    )
+    odd = replace(odd, posterior=NO_SAMPLES, covariance=None, data=None)
     path = tmp_path / "odd.json"
     odd.save(path)
     assert same(Identification.load(path), odd)
@@ -222,8 +231,8 @@ DAMAGES = [
     (lambda d: d.update(rms=True), "/rms: found True; need a number"),
     (lambda d: d.update(evaluations=1.5), "/evaluations: found 1.5; need a whole number"),
     (lambda d: d.update(extra=1), "/: found 'extra'; need one of the fields"),
-    (lambda d: d["estimates"][0].update(status="sure"), "/estimates/0/status: found 'sure'"),
-    (lambda d: d["estimates"][0].update(interval95=[1]), "/estimates/0/interval95.*2 entries"),
+    (lambda d: d["parameters"][0].update(status="sure"), "/parameters/0/status: found 'sure'"),
+    (lambda d: d["parameters"][0].update(interval95=[1]), "/parameters/0/interval95.*2 entries"),
     (lambda d: d.update(warnings="none"), "/warnings: found 'none'; need a list"),
     (lambda d: d["simulated"][0].__setitem__(0, {"shape": [3]}), "shape of an empty array"),
     (lambda d: d["simulated"][0].__setitem__(0, ["a"]), "/simulated/0/0.*need a list of numbers"),
@@ -296,7 +305,7 @@ def test_simulation_has_the_step_of_the_result(found: Identification) -> None:
 def test_simulation_reads_an_input_as_the_result_did(found: Identification) -> None:
     inputs, values = Channel("u", T, STEPS), found.parameter_values
     assert inputs.effective_hold == "zero"
-    lines = replace(found, input_holds=(InputHold("u", "first", None),))
+    lines = replace(found, input_hold=(InputHold("u", "first", None),))
     answer = simulate("fopdt", inputs, lines).channel("y").values
     asked = replace_substeps(load_model("fopdt"), found.substeps)
     expected = simulate(asked, replace(inputs, hold="first"), values).channel("y").values
@@ -563,10 +572,10 @@ def test_figures_may_be_a_list(found: Identification) -> None:
 
 
 def test_a_result_is_a_mapping_of_names_to_estimates(found: Identification) -> None:
-    names = [estimate.name for estimate in found.estimates]
+    names = [estimate.name for estimate in found.parameters]
     assert len(found) == len(names)
     assert list(found) == list(found.keys()) == names
-    assert list(found.values()) == list(found.estimates)
+    assert list(found.values()) == list(found.parameters)
     assert dict(found) == dict(found.items()) == {name: found[name] for name in names}
     assert found.get("L") is found["L"]
     assert found.get("M") is None

@@ -18,7 +18,7 @@ from sysid.identification.identify import identify
 from sysid.models.parse import parse_model
 from sysid.results.bands import pool_noise
 from sysid.results.figures import draw_figures
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.search.refine import refine_candidates
 from sysid.simulation.metrics import ChannelMetrics
 from sysid.simulation.problem import Problem
@@ -152,8 +152,7 @@ def test_a_band_is_as_wide_as_the_interval_where_few_samples_count() -> None:
     record = make_line(0.0)
     noisy = replace(record.outputs[0], values=record.outputs[0].values + slow)
     found = identify(LINE, Record((), (noisy,)), QUICK, loss=Loss(noise_model="white"))
-    assert found.uncertainty is not None
-    assert found.uncertainty.degrees < 20
+    assert found.degrees < 20
     interval = found["x(0)"].interval95
     assert interval is not None
     [bands] = found.compute_bands()
@@ -192,7 +191,7 @@ def test_the_figure_of_the_response_has_the_bands_of_its_record(lag: Identificat
     names = [trace["name"] for trace in figure["data"]]
     assert names.index("95 % prediction band") < names.index("95 % confidence band")
     assert names.index("95 % confidence band") < names.index("measured")
-    without = draw_figures(replace(lag, uncertainty=None), ["response"])[0][1]
+    without = draw_figures(replace(lag, covariance=None), ["response"])[0][1]
     assert without["data"][0]["name"] == "measured"
 
 
@@ -211,7 +210,7 @@ def test_several_records_have_bands_with_noise_of_their_own() -> None:
     first, second = (found.compute_bands(experiment=e)[0] for e in (0, 1))
     widths = [np.diff(one.prediction, axis=1).mean() for one in (first, second)]
     assert widths[1] > 5 * widths[0]
-    noise = pool_noise(found.agreement, 237.0)
+    noise = pool_noise(found.agreement.estimation, 237.0)
     assert noise[0, "y"] == pytest.approx(np.sqrt((0.02**2 + 0.2**2) / 2), rel=0.15)
     metrics = [ChannelMetrics(0, "y", "V", 10, 0.3, 0.0), ChannelMetrics(1, "y", "V", 30, 0.1, 0.0)]
     assert pool_noise(metrics, 40.0)[0, "y"] == pytest.approx(np.sqrt(0.03))

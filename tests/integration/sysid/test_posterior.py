@@ -37,9 +37,9 @@ def test_the_lag_of_a_tube_of_3_m_is_known_better_than_its_standard_error_says()
         posterior=True,
     )
     assert found.posterior is not None
-    assert found.posterior.is_converged
+    assert found.posterior.converged
     by_name = {parameter.name: parameter for parameter in found.posterior.parameters}
-    (lag,) = [estimate for estimate in found.estimates if estimate.name == "L"]
+    (lag,) = [estimate for estimate in found.parameters if estimate.name == "L"]
     assert lag.interval95 is not None
     assert lag.stderr is not None
     assert lag.value < 2.0 * lag.stderr  # so the linear interval is cut at 0

@@ -29,8 +29,8 @@ y += 0.01 * random.standard_normal(20_000)
 record = Record((Channel("u", times, u),), (Channel("y", times, y),))
 settings = GeneticAlgorithm(population=16, generations=4)
 found = identify(load_model("fopdt"), record, settings, validation_fraction=0.2)
-text = repr((found.estimates, found.rms, found.fit_percent, found.rms_validation, found.agreement,
-             found.history, found.uncertainty.covariance.tobytes()))
+text = repr((found.parameters, found.rms, found.fit_percent, found.rms_validation, found.agreement,
+             found.history, found.covariance.tobytes()))
 print(hashlib.sha256(text.encode()).hexdigest())
 """
 

@@ -14,7 +14,7 @@ from sysid.data.splitting import split_record
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
 from tests.searching import DUFFING, force
@@ -61,11 +61,11 @@ def standard_deviation(found: Identification, record: Record) -> list[float]:
 def test_the_true_model_fits_both_parts_alike(model: str) -> None:
     record = add_output_noise(free_run(model, DUFFING), Noise(0.01, 1), 0)
     found = identify(load_model(model), record, BRIEF, parameters=NEAR, validation_fraction=0.3)
-    assert found.fit_percent > 97
-    assert found.fit_percent_validation == pytest.approx(found.fit_percent, abs=1.0)
+    assert found.fit_percent.estimation > 97
+    assert found.fit_percent.validation == pytest.approx(found.fit_percent.estimation, abs=1.0)
     assert found.rms_validation == pytest.approx(found.rms, rel=0.2)
     assert [part[0].size for part in (*found.simulated, *found.simulated_validation)] == [420, 180]
-    assert [one.samples for one in found.agreement_validation] == [180]
+    assert [one.samples for one in found.agreement.validation] == [180]
 
 
 def test_an_estimated_initial_state_goes_on_into_the_part_kept() -> None:
@@ -174,10 +174,10 @@ def heated(last: float, sign: float = 1.0) -> tuple[Identification, float]:
 
 def test_a_part_that_hardly_moves_has_an_rms_and_no_fit() -> None:
     found, spread = heated(0.0)
-    assert found.fit_percent > 95
-    assert found.fit_percent_validation is not None
-    assert np.isnan(found.fit_percent_validation)
-    assert np.isnan(found.agreement_validation[0].fit_percent)
+    assert found.fit_percent.estimation > 95
+    assert found.fit_percent.validation is not None
+    assert np.isnan(found.fit_percent.validation)
+    assert np.isnan(found.agreement.validation[0].fit_percent)
     assert found.rms_validation == pytest.approx(0.02, rel=0.3)
     [note] = [one for one in found.warnings if "hardly move" in one]
     assert f"their standard deviation is {spread:.3g}, " in note
@@ -185,17 +185,17 @@ def test_a_part_that_hardly_moves_has_an_rms_and_no_fit() -> None:
 
 def test_a_model_that_predicts_worse_than_the_mean_is_not_validated() -> None:
     found, spread = heated(1.0, -1.0)
-    assert found.fit_percent > 95
+    assert found.fit_percent.estimation > 95
     assert found.rms_validation is not None
     assert found.rms_validation > spread
-    assert {one.status for one in found.estimates} == {"not validated"}
+    assert {one.status for one in found.parameters} == {"not validated"}
     assert "the model predicts the validation data worse than their mean" in found.warnings[0]
     assert f"RMS {found.rms_validation:.3g} against {spread:.3g}, " in found.warnings[0]
 
 
 def test_a_part_that_moves_less_than_the_rest_keeps_its_fit() -> None:
     found, _ = heated(0.25)
-    assert {one.status for one in found.estimates} == {"identified"}
-    assert found.fit_percent_validation is not None
-    assert found.fit_percent_validation > 80
+    assert {one.status for one in found.parameters} == {"identified"}
+    assert found.fit_percent.validation is not None
+    assert found.fit_percent.validation > 80
     assert not any("hardly move" in one for one in found.warnings)

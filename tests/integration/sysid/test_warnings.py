@@ -13,7 +13,7 @@ from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.simulation.simulate import simulate
 
 QUICK = GeneticAlgorithm(population=30, generations=120)
@@ -99,8 +99,8 @@ def test_an_estimate_that_may_as_well_be_zero_is_told() -> None:
     model = parse_model(FIRST)
     y = response(model, steps(), sd=0.05, K=1.5, T=0.3, L=0.2, y0=0.0)
     found = identify(model, record(steps(), y), QUICK)
-    vague = {e.name for e in found.estimates if e.stderr and e.stderr >= abs(e.value)}
-    for estimate in found.estimates:
+    vague = {e.name for e in found.parameters if e.stderr and e.stderr >= abs(e.value)}
+    for estimate in found.parameters:
         expected = estimate.name in vague
         assert told(found, f"the standard error of {estimate.name},") is expected
 
@@ -111,7 +111,7 @@ def test_an_input_that_does_not_excite_names_what_it_leaves_open(level: float) -
     model = parse_model(FIRST)
     y = response(model, u, K=1.5, T=0.3, L=0.0, y0=0.2)
     found = identify(model, record(u, y), QUICK)
-    open_ = {e.name for e in found.estimates if e.stderr is None}
+    open_ = {e.name for e in found.parameters if e.stderr is None}
     assert open_
     (text,) = (w for w in found.warnings if "excites nothing" in w)
     assert text.startswith("input 'u' is constant")
@@ -140,7 +140,7 @@ def test_an_estimate_that_the_integration_step_has_made_is_replaced_and_told(
     found = identify(coarse, Record((inlet,), (noisy,)))
     assert told(found, "the integration step of the model, substeps: 1") == too_long
     assert (found.substeps > substeps) == too_long
-    for one in found.estimates:
+    for one in found.parameters:
         assert one.stderr is not None
         assert abs(one.value - truth[one.name]) < 3 * one.stderr
 
@@ -156,7 +156,7 @@ def test_a_constant_output_is_told(level: float) -> None:
 
 def test_what_is_not_identified_tells_the_bound_at_which_it_lies() -> None:
     found = identify(parse_model(FIRST), record(steps(), np.full(N, 3.0)), QUICK)
-    open_ones = [e for e in found.estimates if e.status in ("group", "unidentifiable")]
+    open_ones = [e for e in found.parameters if e.status in ("group", "unidentifiable")]
     at_bound = {e.name for e in open_ones if e.value in (e.lower, e.upper)}
     assert at_bound
     for one in open_ones:
@@ -170,7 +170,7 @@ def test_one_step_ahead_without_an_output_that_is_a_state_is_told_to_be_the_free
     free = identify(hidden, record(steps(), y), QUICK)
     ahead = identify(hidden, record(steps(), y), QUICK, prediction="one-step")
     assert told(ahead, "no output (y) is a state by itself")
-    assert [one.stderr for one in ahead.estimates] == [one.stderr for one in free.estimates]
+    assert [one.stderr for one in ahead.parameters] == [one.stderr for one in free.parameters]
     tube, narrow = load_model("tube"), {"L": {"upper": 1.0}}
     seen = identify(tube, record(steps(), y), QUICK, prediction="one-step", parameters=narrow)
     assert not told(seen, "is a state by itself")

@@ -15,7 +15,7 @@ from sysid.data.records import Channel, Record, Recording
 from sysid.identification.identify import identify
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit
 from sysid.simulation.simulate import simulate
@@ -63,7 +63,7 @@ def record(seed: int = 1, start: float = 0.0) -> Record:
 
 
 def values(found: Identification) -> dict[str, float]:
-    return {one.name: one.value for one in found.estimates}
+    return {one.name: one.value for one in found.parameters}
 
 
 def test_every_experiment_has_an_initial_state_of_its_own() -> None:
@@ -101,7 +101,7 @@ def test_samples_that_are_missing_do_not_count() -> None:
     gaps = replace(whole, outputs=(replace(whole.outputs[0], values=y),))
     found = identify(lag_model(), gaps, QUICK)
     assert values(found) == pytest.approx(TRUTH, abs=1e-4)
-    assert found.agreement[0].samples == np.count_nonzero(np.isfinite(y))
+    assert found.agreement.estimation[0].samples == np.count_nonzero(np.isfinite(y))
 
 
 def test_an_output_at_irregular_times_is_compared_at_its_own_times() -> None:

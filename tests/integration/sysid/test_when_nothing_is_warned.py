@@ -11,8 +11,9 @@ from sysid.data.records import Channel, Record
 from sysid.diagnosis.warnings import _warn_correlations
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import analyse_estimate
 from tests.searching import DUFFING as TRUTH
 from tests.searching import noisy, record
 
@@ -53,7 +54,7 @@ def test_residuals_of_the_solver_are_no_doubt_about_the_minimum() -> None:
     for i in range(t.size - 1):
         y[i + 1] = decay * y[i] + (1 - decay) * gain * read[i]
     found = identify(FOPDT, Record((Channel("u", t, command),), (Channel("y", t, y),)))
-    values = {estimate.name: estimate.value for estimate in found.estimates}
+    values = {estimate.name: estimate.value for estimate in found.parameters}
     assert values["L"] == pytest.approx(lag, abs=1e-4)
     assert not told(found, "not a local optimum")
     assert not told(found, "white")
@@ -93,13 +94,16 @@ def test_a_lag_that_may_as_well_be_zero_is_not_separable_from_what_it_is_on_a_ri
     found = identify(FOPDT, driven("u", TIMES / 6, y), parameters=sought)
     assert told(found, "T and L not separable")
     # Coloured residuals may turn the ellipsoid; what one sensitivity makes up for in another stays.
-    assert found.uncertainty is not None
-    turned = replace(found.uncertainty, correlation=np.array([[1.0, 0.5], [0.5, 1.0]]))
-    [ridge] = _warn_correlations(turned, found.estimates, {"L"})
-    r = found.uncertainty.sensitivity_correlation[0, 1]
+    problem = Problem.build(FOPDT, [driven("u", TIMES / 6, y)], parameters=sought)
+    theta = np.array([found[name].value for name in problem.free_names])
+    uncertainty = analyse_estimate(problem, theta).uncertainty
+    assert uncertainty is not None
+    turned = replace(uncertainty, correlation=np.array([[1.0, 0.5], [0.5, 1.0]]))
+    [ridge] = _warn_correlations(turned, found.parameters, {"L"})
+    r = uncertainty.sensitivity_correlation[0, 1]
     assert f"not separable (correlation 0.500, {r:.3f} if the residuals were white)" in ridge
     apart = replace(turned, sensitivity_correlation=turned.correlation)
-    assert _warn_correlations(apart, found.estimates, {"L"}) == []
+    assert _warn_correlations(apart, found.parameters, {"L"}) == []
     strong = replace(turned, correlation=np.array([[1.0, 0.98], [0.98, 1.0]]))
-    [text] = _warn_correlations(strong, found.estimates, set())
+    [text] = _warn_correlations(strong, found.parameters, set())
     assert text.startswith("T and L have the correlation 0.980: ")  # `r` is a parameter of sopdt

@@ -15,7 +15,7 @@ from service.formats.mcap import read_fitted_outputs
 from service.queue.packed_results import LAYOUTS, RESULT_ROWS, PackedResults, RowLayout, pack_rows
 from service.queue.run_writes import RunOutcome
 from service.storage.tables import Base
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from tests.runs import RECORDS, spec
 from workers.protocol import AdvanceRun, CompleteRun, RunConclusion
 from workers.tasks import process_pack
@@ -58,14 +58,14 @@ def test_a_row_has_the_values_of_its_run(complete: list[CompleteRun]) -> None:
         assert (cells["id"], cells["spec_hash"]) == (run.run, run.spec.reuse_key)
         assert (cells["best_rms"], cells["evaluations"]) == (one.rms, one.evaluations)
         assert (cells["generations"], cells["seconds"]) == (one.generations, 0.25)
-        assert cells["fit_estimation"] == one.fit_percent
+        assert cells["fit_estimation"] == one.fit_percent.estimation
     assert packed.runs == ("run_1", "run_2", "run_3")
     assert packed.evaluations == sum(one.evaluations for one in found)
     assert packed.best_rms == min(one.rms for one in found)
     assert packed.estimates == {}
     told = encode(complete, reports_estimates=True).estimates
     assert told == {
-        run.run: {one.name: one.value for one in run.concluded.identification.estimates}
+        run.run: {one.name: one.value for one in run.concluded.identification.parameters}
         for run in complete
     }
 

@@ -1,9 +1,16 @@
 """What pages call the fields that distinguish a run, and what their notes advise."""
 
+from dataclasses import replace
+
 from service.core.states import JobState
+from service.jobs.stored_run import StoredRun
 from service.pages.views import format_cell, to_run_view
-from service.storage.tables import Run
+from service.storage.tables import Job, Run
+from sysid.core.value_documents import encode
+from sysid.models.catalogue.load import load_model
+from sysid.results.result import Result
 from tests.repository import ROOT
+from tests.results import conclude
 
 
 def test_fields_are_told_by_their_last_part_and_those_that_end_alike_in_full() -> None:
@@ -26,9 +33,10 @@ def test_a_note_names_the_fields_of_the_form() -> None:
         labels={},
         evaluations=0,
         generations=0,
-        result={"warnings": [note], "verdict": {"trust": "limited", "text": "", "reasons": []}},
+        result=encode(replace(conclude().identification, warnings=(note,)), Result),
     )
-    [shown] = to_run_view(run, "", {}).warnings
+    job = Job(spec={"model": "fopdt"})
+    [shown] = to_run_view(StoredRun(job, run, {}, load_model("fopdt")), "", {}).warnings
     assert shown == (
         "Read as straight lines (“u between samples: straight line (first)”) or with "
         "“noise: first-order coloured (ar1)” it differs"

@@ -4,11 +4,12 @@ import pytest
 
 from service.runs.comparison import find_furthest_pair
 from sysid.core.text import find_shown_error, format_interval, join_estimate, plain_estimate
+from sysid.uncertainty.estimates import Estimate
 
 
-def estimate(value: float, stderr: float | None) -> dict[str, object]:
-    ends = None if stderr is None else [value - 2 * stderr, value + 2 * stderr]
-    return {"value": value, "stderr": stderr, "interval95": ends}
+def estimate(value: float, stderr: float | None) -> Estimate:
+    ends = None if stderr is None else (value - 2 * stderr, value + 2 * stderr)
+    return Estimate("L", "s", value, 0.0, 10.0, stderr, ends, "identified")
 
 
 def test_intervals_that_meet_tell_nothing_apart() -> None:

@@ -7,6 +7,9 @@ import pytest
 
 from service.repositories.trends import TrendRow
 from service.trends.points import build_quantities, group_by_label, read_onset_estimates
+from sysid.residuals.onset_delay import OnsetDelay
+from sysid.results.result import Agreements
+from sysid.uncertainty.estimates import Estimate, EstimateStatus
 
 
 def row(run: str, x: float, cell: dict[str, Any] | None = None, **values: Any) -> TrendRow:
@@ -15,25 +18,27 @@ def row(run: str, x: float, cell: dict[str, Any] | None = None, **values: Any) -
         "labels": {"x": x},
         "evaluations": 10,
         "best_rms": 0.5,
-        "parameters": [],
-        "onset_delays": [],
-        "agreement": {"estimation": []},
-        "warnings": [],
-        "correlation_times": {},
+        "parameters": (),
+        "onset_delays": (),
+        "agreement": Agreements((), ()),
+        "warnings": (),
+        "noise_model": "white",
     }
     return TrendRow(**{**known, **values, "id": run, "cell": cell or {}})
 
 
 def parameter(
-    value: float, stderr: float | None, status: str = "identified", **bounds: Any
-) -> dict[str, Any]:
-    ends = {"lower": 0.0, "upper": 1.0, **bounds}
-    return {"name": "L", "unit": "s", "value": value, "stderr": stderr, "status": status, **ends}
+    value: float,
+    stderr: float | None,
+    status: EstimateStatus = "identified",
+    lower: float = 0.0,
+    upper: float = 1.0,
+) -> Estimate:
+    return Estimate("L", "s", value, lower, upper, stderr, None, status)
 
 
-def onset(delay: float | None, spread: float | None, events: int) -> dict[str, Any]:
-    known = {"input": "u", "output": "y", "unit": "s"}
-    return {**known, "delay": delay, "spread": spread, "events": events}
+def onset(delay: float | None, spread: float | None, events: int) -> OnsetDelay:
+    return OnsetDelay(0, "u", "y", delay, spread, events)
 
 
 def chosen(*rows: TrendRow) -> dict[float, list[str]]:

@@ -314,7 +314,7 @@ def test_estimates_from_a_part_are_nearer_the_truth_where_its_past_is_known() ->
         step = {"trim": {"rows": [CUT, CUT + 40], "history": keep}}
         record = record_of(derive_recording(plant(noise=0.01), [step]))
         found = identify(model, record, SHORT, parameters=bounds)
-        values = {one.name: one.value for one in found.estimates}
+        values = {one.name: one.value for one in found.parameters}
         errors[keep] = abs(values["K"] - TRUE["K"]) + abs(values["T"] - TRUE["T"])
     assert errors[True] < 0.05
     assert errors[False] > 3 * errors[True]

@@ -97,7 +97,7 @@ def test_the_moves_are_those_of_an_estimate_with_that_start_free() -> None:
         "plant at rest"
     )
     freed = identify(parse_model(document), record, GeneticAlgorithm(generations=50))
-    for estimate in freed.estimates[:3]:
+    for estimate in freed.parameters[:3]:
         assert f"{estimate.name} is {estimate.value:.4g} ± {estimate.stderr:.2g}" in note
 
 

@@ -25,7 +25,7 @@ from sysid.identification.run import advance_run, begin_run
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import MAX_SUBSTEPS, Model, replace_substeps
 from sysid.models.parse import parse_model
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
@@ -69,7 +69,7 @@ def sampled(values: Mapping[str, float], sd: float = 0.02, substeps: int = 200) 
 
 
 def by_name(found: Identification) -> dict[str, Estimate]:
-    return {one.name: one for one in found.estimates}
+    return {one.name: one for one in found.parameters}
 
 
 def deviation(one: Estimate, value: float) -> float:
@@ -157,7 +157,7 @@ def test_signals_of_a_finer_step_are_computed_again_bit_for_bit() -> None:
     found = identify(two_lags(1), record, QUICK, validation_fraction=0.3)
     assert found.substeps > 1
     records = prepare_records([record], fraction=0.3)
-    again = resimulate_run(two_lags(1), records, FitSettings(), found.estimates, found.substeps)
+    again = resimulate_run(two_lags(1), records, FitSettings(), found.parameters, found.substeps)
     assert [one.tobytes() for one in again.simulated[0]] == [
         one.tobytes() for one in found.simulated[0]
     ]
@@ -213,7 +213,7 @@ def test_the_signals_of_a_result_are_those_of_its_step() -> None:
     found = identify(model, record, QUICK, validation_fraction=0.3)
     used = replace_substeps(model, found.substeps)
     assert found.substeps > 1
-    values = {one.name: one.value for one in found.estimates}
+    values = {one.name: one.value for one in found.parameters}
     (outlet,) = simulate(used, record.inputs, values, times=record.outputs[0].times).channels
     first, last = found.simulated[0][0], found.simulated_validation[0][0]
     np.testing.assert_allclose(first, outlet.values[: first.size], rtol=1e-9, atol=1e-12)
@@ -227,7 +227,7 @@ def unsettled(found: Identification) -> list[str]:
     """What is said of the estimates that half the step would change."""
     return [
         one.reason
-        for one in found.estimates
+        for one in found.parameters
         if one.status == "unidentifiable"
         and one.reason.startswith("half the integration step still changes it")
     ]

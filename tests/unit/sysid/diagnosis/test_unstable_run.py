@@ -14,7 +14,7 @@ from sysid.diagnosis.unstable_run import (
 )
 from sysid.identification.identify import identify
 from sysid.models.parse import parse_model
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
 
@@ -64,7 +64,7 @@ def test_one_step_ahead_estimates_of_an_unstable_plant_are_told(seed: int) -> No
     (told,) = list_told(found)
     assert "the free run is unstable" in told
     ahead = identify(PLANT, record, prediction="one-step")
-    for one in ahead.estimates:
+    for one in ahead.parameters:
         assert one.interval95 is not None
         assert one.interval95[0] <= TRUTH[one.name] <= one.interval95[1]
         assert f"{one.name} = {one.value:.4g} ± {one.stderr:.2g} 1/s" in told

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from service.figures.csv import to_csv
+from sysid.core.settings import LossKind
 from sysid.figures import plotly, signals
 from sysid.figures.data import (
     ExperimentTraces,
-    FreeParameter,
-    IslandImprovement,
     OutputTraces,
-    RunFigureData,
+    SearchTraces,
     SignalTrace,
 )
 from sysid.figures.theme import (
@@ -25,29 +24,40 @@ from sysid.figures.theme import (
     thin_indices,
     window_slice,
 )
+from sysid.models.parameters import Parameter
 from sysid.results.figures import label_fitness
+from sysid.search.state import Improvement, IslandSummary
+from sysid.uncertainty.estimates import CorrelationMatrix, Estimate
 
 
-def island(points: int, start: float = 100.0) -> list[IslandImprovement]:
+def island(points: int, start: float = 100.0) -> list[Improvement]:
     return [
-        IslandImprovement(
-            n, 50 * n, start * 0.99**n, "sequence" if n % 5 == 4 else "genetic", (n / 10,)
-        )
+        Improvement(n, 50 * n, start * 0.99**n, "sequence" if n % 5 == 4 else "genetic", (n / 10,))
         for n in range(points)
     ]
 
 
-def run(**more: object) -> RunFigureData:
+LAG = Estimate("L", "s", 0.1127, 0.0, 0.5, 0.0002, (0.1123, 0.1131), "identified")
+CORRELATION = CorrelationMatrix(("T", "L"), np.array([[1.0, -0.7], [-0.7, 1.0]]))
+
+
+def islands(*reached: tuple[float, float | None]) -> list[IslandSummary]:
+    return [IslandSummary(champion, refined, (), 1) for champion, refined in reached]
+
+
+ISLANDS = islands((2.0, 1.1), (1.5, 1.0), (9.0, None))
+
+
+def run(**more: object) -> SearchTraces:
     known = {
         "generations": 400,
-        "parameters": [FreeParameter("L", "s", 0.0, 0.5, value=0.1127, stderr=0.0002)],
+        "parameters": [Parameter("L", 0.0, 0.5, "s")],
+        "estimates": {"L": LAG},
         "history": [island(30), island(20, 80.0)],
         "epoch": 25,
         "migrations": [1, 2, 3],
-        "islands": [(2.0, 1.1), (1.5, 1.0), (9.0, None)],
-        "correlation": {"names": ["T", "L"], "matrix": [[1.0, -0.7], [-0.7, 1.0]]},
     }
-    return RunFigureData(id="run_1", unit="kPa", **{**known, **more})  # type: ignore[arg-type]
+    return SearchTraces("kPa", **{**known, **more})  # type: ignore[arg-type]
 
 
 def signal(samples: int, name: str = "y") -> SignalTrace:
@@ -68,15 +78,18 @@ def drawn(figure: plotly.Figure, name: str) -> dict[str, Any]:
 @pytest.mark.parametrize(
     "figure",
     [
-        plotly.plot_history,
-        plotly.plot_convergence,
-        plotly.plot_correlation,
-        plotly.plot_waterfall,
+        plotly.plot_history(run()),
+        plotly.plot_history(SearchTraces("V")),
+        plotly.plot_convergence(run()),
+        plotly.plot_convergence(SearchTraces("V")),
+        plotly.plot_correlation(CORRELATION),
+        plotly.plot_correlation(None),
+        plotly.plot_waterfall(ISLANDS, "V"),
+        plotly.plot_waterfall([], "V"),
     ],
 )
-@pytest.mark.parametrize("evidence", [run(), RunFigureData("run_0", "V")], ids=["full", "empty"])
-def test_every_figure_is_json_without_nan(figure, evidence) -> None:  # type: ignore[no-untyped-def]
-    assert json.loads(json.dumps(figure(evidence), allow_nan=False))["layout"]["height"] > 0
+def test_every_figure_is_json_without_nan(figure: plotly.Figure) -> None:
+    assert json.loads(json.dumps(figure, allow_nan=False))["layout"]["height"] > 0
 
 
 def test_a_history_has_a_line_per_island_on_a_log_axis_with_its_unit() -> None:
@@ -88,15 +101,19 @@ def test_a_history_has_a_line_per_island_on_a_log_axis_with_its_unit() -> None:
 
 
 def test_the_axis_of_a_number_without_dimension_names_no_unit() -> None:
-    for draw in (plotly.plot_history, plotly.plot_waterfall):
-        assert draw(replace(run(), unit="1"))["layout"]["yaxis"]["title"]["text"] == "RMS"
+    for figure in (
+        plotly.plot_history(replace(run(), unit="1")),
+        plotly.plot_waterfall(ISLANDS, "1"),
+    ):
+        assert figure["layout"]["yaxis"]["title"]["text"] == "RMS"
 
 
 @pytest.mark.parametrize(("smallest", "digits"), [(0.5, None), (0.05, "D2"), (1e-6, None)])
 def test_digits_of_a_log_axis_do_not_lie_upon_each_other(
     smallest: float, digits: str | None
 ) -> None:
-    axis = plotly.plot_waterfall(run(islands=((1.0, None), (1.0, smallest))))["layout"]["yaxis"]
+    reached = islands((1.0, None), (1.0, smallest))
+    axis = plotly.plot_waterfall(reached, "kPa")["layout"]["yaxis"]
     assert axis.get("dtick") == digits
 
 
@@ -138,7 +155,7 @@ def test_a_parameter_is_drawn_between_its_bounds_and_its_caption_has_its_error()
 
 
 def test_a_parameter_over_decades_has_a_log_axis() -> None:
-    sought = FreeParameter("T", "s", 0.01, 100.0, "log")
+    sought = Parameter("T", 0.01, 100.0, "s", "log")
     axis = plotly.plot_convergence(run(parameters=[sought]))["layout"]["yaxis"]
     assert axis["type"] == "log"
     assert axis["range"][0] < -2 < 2 < axis["range"][1]
@@ -147,8 +164,8 @@ def test_a_parameter_over_decades_has_a_log_axis() -> None:
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 12])
 @pytest.mark.parametrize("columns", [1, 2, 3])
 def test_small_plots_lie_inside_the_figure_and_beside_each_other(count: int, columns: int) -> None:
-    sought = [FreeParameter(f"p{n}", "1", 0.0, 1.0) for n in range(count)]
-    history = [[IslandImprovement(0, 0, 1.0, "start", (0.5,) * count)]]
+    sought = [Parameter(f"p{n}", 0.0, 1.0) for n in range(count)]
+    history = [[Improvement(0, 0, 1.0, "genetic", (0.5,) * count)]]
     layout = plotly.plot_convergence(run(parameters=sought, history=history), columns)["layout"]
     boxes = []
     for n in range(count):
@@ -163,7 +180,7 @@ def test_small_plots_lie_inside_the_figure_and_beside_each_other(count: int, col
 
 
 def test_the_waterfall_puts_the_best_island_first() -> None:
-    after = drawn(plotly.plot_waterfall(run()), "after refinement")
+    after = drawn(plotly.plot_waterfall(ISLANDS, "kPa"), "after refinement")
     assert after["text"] == ["island 2", "island 1", "island 3"]
     assert after["y"] == [1.0, 1.1, None]
 
@@ -229,14 +246,14 @@ def test_the_heights_that_a_page_reserves_are_those_of_the_figures() -> None:
         "height"
     ] == signals.signals_height(2)
     assert plotly.plot_convergence(run(), 3)["layout"]["height"] == plotly.convergence_height(1, 3)
-    assert plotly.plot_correlation(run())["layout"]["height"] == plotly.correlation_height(2)
+    assert plotly.plot_correlation(CORRELATION)["layout"]["height"] == plotly.correlation_height(2)
 
 
 def test_the_numbers_of_a_figure_are_one_row_each_in_csv() -> None:
     lines = to_csv(signals.plot_signals([signal(3, "a,b")])).splitlines()
     assert lines[0] == "series,x,y"
     assert lines[1:3] == ['"a,b",0.0,0.0', '"a,b",0.01,0.009999833']
-    assert to_csv(plotly.plot_correlation(run())).splitlines()[2] == ",L,T,-0.7"
+    assert to_csv(plotly.plot_correlation(CORRELATION)).splitlines()[2] == ",L,T,-0.7"
     line = to_csv(signals.plot_signals([signal(3, "=1+1")])).splitlines()[1]
     assert line.startswith("'=1+1")  # no formula in a spreadsheet
 
@@ -281,10 +298,12 @@ def test_a_window_has_one_sample_more_at_each_side() -> None:
     assert window_slice(times, -5.0, 50.0) == slice(0, 10)
 
 
-@pytest.mark.parametrize("draw", [plotly.plot_history, plotly.plot_waterfall])
-def test_a_robust_loss_is_not_called_the_rms(draw):
-    robust = label_fitness("soft-l1")
-    shown = draw(run(fitness_label=robust))["layout"]["yaxis"]["title"]["text"]
-    assert shown == "soft-l1 loss, as RMS [kPa]"
-    plain = draw(run(fitness_label=label_fitness("squares")))
-    assert plain["layout"]["yaxis"]["title"]["text"] == "RMS [kPa]"
+def test_a_robust_loss_is_not_called_the_rms() -> None:
+    def name_axes(loss: LossKind) -> set[str]:
+        label = label_fitness(loss)
+        history = plotly.plot_history(run(fitness_label=label))
+        waterfall = plotly.plot_waterfall(ISLANDS, "kPa", label)
+        return {figure["layout"]["yaxis"]["title"]["text"] for figure in (history, waterfall)}
+
+    assert name_axes("soft-l1") == {"soft-l1 loss, as RMS [kPa]"}
+    assert name_axes("squares") == {"RMS [kPa]"}

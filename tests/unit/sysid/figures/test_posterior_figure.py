@@ -4,31 +4,52 @@ import numpy as np
 import pytest
 
 from service.figures.csv import to_csv
-from sysid.figures.data import CornerParameter, Floats
+from sysid.figures.data import Floats
+from sysid.figures.plotly import Figure
 from sysid.figures.posterior import (
     MAX_SHOWN,
+    Corner,
     choose_shown,
     estimate_region,
     plot_posterior,
     posterior_height,
 )
+from sysid.uncertainty.estimates import (
+    CorrelationMatrix,
+    Estimate,
+    Posterior,
+    PosteriorParameter,
+)
 
 
 def corner(
     name: str, samples: Floats, stderr: float | None = 1.0, bounds: tuple[float, float] = (-9, 9)
-) -> CornerParameter:
-    low, high = np.quantile(samples, [0.025, 0.975])
+) -> Corner:
+    low, middle, high = np.quantile(samples, [0.025, 0.5, 0.975])
     interval = None if stderr is None else (-1.96 * stderr, 1.96 * stderr)
-    return CornerParameter(name, "s", *bounds, 0.0, stderr, interval, (low, high), samples)
+    return Corner(
+        Estimate(name, "s", 0.0, *bounds, stderr, interval, "identified"),
+        PosteriorParameter(name, "s", middle, (low, high), 100.0),
+        samples,
+    )
 
 
-def draw(count: int, n: int = 1000) -> list[CornerParameter]:
+def plot(corners: list[Corner], correlation: Floats) -> Figure:
+    names = tuple(one.sampled.name for one in corners)
+    matrix = CorrelationMatrix(names, correlation)
+    samples = np.column_stack([one.samples for one in corners])
+    sampled = tuple(one.sampled for one in corners)
+    posterior = Posterior(sampled, samples, matrix, 8, 100, 0.4, 800, True, "")
+    return plot_posterior(posterior, [one.estimate for one in corners], matrix)
+
+
+def draw(count: int, n: int = 1000) -> list[Corner]:
     values = np.random.default_rng(1).standard_normal((count, n))
     return [corner(f"p{i}", row) for i, row in enumerate(values)]
 
 
 def test_a_corner_has_a_histogram_of_each_and_a_cell_of_each_pair() -> None:
-    figure = plot_posterior(draw(3), np.eye(3))
+    figure = plot(draw(3), np.eye(3))
     kinds = [trace["type"] for trace in figure["data"]]
     assert (kinds.count("bar"), kinds.count("contour")) == (3, 3)
     assert figure["layout"]["height"] == posterior_height(3)
@@ -65,15 +86,15 @@ def test_the_region_ends_at_the_bounds() -> None:
 
 def test_a_parameter_without_standard_error_has_no_ellipse() -> None:
     first, second = draw(2)
-    names = {trace["name"] for trace in plot_posterior([first, second], np.eye(2))["data"]}
+    names = {trace["name"] for trace in plot([first, second], np.eye(2))["data"]}
     assert "95 % ellipse of the standard errors" in names
     bare = corner("p1", second.samples, None)
-    names = {trace["name"] for trace in plot_posterior([first, bare], np.eye(2))["data"]}
+    names = {trace["name"] for trace in plot([first, bare], np.eye(2))["data"]}
     assert "95 % ellipse of the standard errors" not in names
 
 
 def test_the_ellipse_has_the_correlation_of_the_estimates() -> None:
-    figure = plot_posterior(draw(2), np.array([[1.0, 0.8], [0.8, 1.0]]))
+    figure = plot(draw(2), np.array([[1.0, 0.8], [0.8, 1.0]]))
     (ellipse,) = [trace for trace in figure["data"] if "ellipse" in trace["name"]]
     assert np.corrcoef(ellipse["x"], ellipse["y"])[0, 1] == pytest.approx(0.8, abs=0.03)
     assert max(ellipse["x"]) == pytest.approx(2.448, abs=0.01)
@@ -86,20 +107,20 @@ def test_of_many_parameters_the_most_correlated_are_shown_in_their_order() -> No
     assert len(shown) == MAX_SHOWN
     assert {3, 7} <= set(shown)
     assert shown == sorted(shown)
-    title = plot_posterior(many, np.eye(len(many)))["layout"]["title"]["text"]
+    title = plot(many, np.eye(len(many)))["layout"]["title"]["text"]
     assert title == f"the {MAX_SHOWN} most correlated of {MAX_SHOWN + 2} parameters"
 
 
 def test_samples_that_are_all_equal_are_drawn_without_a_region() -> None:
-    figure = plot_posterior([corner("p0", np.ones(50)), *draw(1, 50)], np.eye(2))
+    figure = plot([corner("p0", np.ones(50)), *draw(1, 50)], np.eye(2))
     assert not any(trace["type"] == "contour" for trace in figure["data"])
 
 
 def test_without_samples_the_figure_is_empty() -> None:
-    assert plot_posterior([], np.zeros((0, 0)))["data"] == []
+    assert plot_posterior(None, [], None)["data"] == []
 
 
 def test_the_csv_has_the_samples_and_no_contour() -> None:
-    lines = to_csv(plot_posterior(draw(2), np.eye(2))).splitlines()
+    lines = to_csv(plot(draw(2), np.eye(2))).splitlines()
     assert lines[0] == "series,x,y"
     assert {len(line.split(",")) for line in lines} == {3}

@@ -1,6 +1,7 @@
 """Figure and table of the residual tests, and what pages show beside the estimates."""
 
 import json
+import math
 import re
 from typing import Any
 
@@ -8,10 +9,14 @@ import numpy as np
 import pytest
 
 from service.figures.csv import to_csv
-from service.pages.diagnostics import to_diagnostics
+from service.pages.render import template_environment
+from service.pages.result_filters import describe_onset, format_excess_bic, format_onset_text
 from sysid.core.text import format_p_value
 from sysid.figures.data import CorrelationTrace
 from sysid.figures.residuals import plot_residuals, residuals_height
+from sysid.residuals.onset_delay import OnsetDelay
+from sysid.residuals.residual_tests import ResidualTest, ResidualTests
+from sysid.results.parts import OrderComparison, OrderFit
 
 
 def trace(
@@ -82,50 +87,27 @@ def test_the_figure_is_json_and_its_numbers_are_csv() -> None:
     assert sum(row.startswith("of y,") for row in rows) == 25 + 51
 
 
-def test_a_run_without_a_result_or_a_test_has_no_findings() -> None:
-    for result in ({}, {"residual_tests": {}, "identifiability": {"groups": []}}):
-        found = to_diagnostics(result)
-        assert (found.verdict, found.n_figures, found.criteria) == ("", 0, {})
-        assert list(found.tests) == list(found.onsets) == list(found.groups) == []
-
-
 def test_a_test_that_was_not_made_says_why() -> None:
-    one = {
-        "experiment": 0,
-        "output": "y",
-        "test": "independence",
-        "input": "u",
-        "outcome": "not tested",
-        "reason": "the input is constant",
-        "p": None,
-    }
-    found = to_diagnostics(
-        {"residual_tests": {"data": "estimation", "passed": None, "tests": [one]}}
-    )
-    assert found.verdict == "not tested"
-    assert found.n_figures == 0
-    assert found.tests[0].reason == "the input is constant"
-    assert found.tests[0].p == "–"
+    reason = "the input is constant"
+    untested = ResidualTest(0, "y", "independence", "u", "not tested", 0, reason=reason)
+    parts = template_environment().get_template("parts.html").module
+    row = parts.residual_tests([untested])  # type: ignore[attr-defined]
+    assert "independent of u" in row
+    assert 'data-label="p">–</td>' in row
+    assert "not tested" in row
+    assert reason in row
+    tests = ResidualTests("estimation", None, (untested,))
+    assert "not tested" in parts.residual_verdict(tests)  # type: ignore[attr-defined]
+    assert parts.residual_verdict(ResidualTests("estimation", None, ())) == ""  # type: ignore[attr-defined]
 
 
 def test_onset_delays_tell_steps_and_spread_or_the_reason() -> None:
-    clear = {
-        "experiment": 0,
-        "input": "u",
-        "output": "y",
-        "delay": 0.129,
-        "unit": "s",
-        "spread": 0.005,
-        "events": 9,
-        "threshold": 0.02,
-        "reason": "",
-    }
-    vague = {**clear, "delay": None, "spread": None, "events": 0, "reason": "it does not rest"}
-    known, unknown = to_diagnostics({"onset_delays": [clear, vague]}).onsets
-    assert re.fullmatch(r"0\.1290\s*s", known.text)
-    assert known.reason.startswith("9 steps, spread 0.0050")
-    assert unknown.text == ""
-    assert unknown.reason == "it does not rest"
+    known = OnsetDelay(0, "u", "y", 0.129, 0.005, 9, 0.02)
+    unknown = OnsetDelay(0, "u", "y", None, reason="it does not rest")
+    assert re.fullmatch(r"0\.1290\s*s", format_onset_text(known))
+    assert describe_onset(known).startswith("9 steps, spread 0.0050")
+    assert format_onset_text(unknown) == ""
+    assert describe_onset(unknown) == "it does not rest"
 
 
 @pytest.mark.parametrize(("p", "text"), [(None, "–"), (0.0, "< 0.001"), (0.0414, "0.041")])
@@ -134,8 +116,9 @@ def test_chances(p: float | None, text: str) -> None:
 
 
 def test_orders_are_shown_by_the_difference_of_bic_also_where_one_has_none() -> None:
-    order = {"order": 1, "delay": 1.0, "delay_stderr": None, "is_open": False}
-    fits = [{**order, "model": f"m{n}", "bic": bic} for n, bic in enumerate([-30.0, -24.5, None])]
-    comparison = {"unit": "s", "delay": "L", "preferred_model": "m0", "fits": fits}
-    shown = to_diagnostics({"order_comparison": comparison}).orders
-    assert [one.bic_text for one in shown] == ["0.0", "5.5", "–"]
+    fits = [
+        OrderFit(f"m{n}", 1, 1.0, None, {}, 1.0, bic)
+        for n, bic in enumerate([-30.0, -24.5, -math.inf])
+    ]
+    orders = OrderComparison("m0", "m0", "L", "s", (1.0, 1.0), "white", tuple(fits))
+    assert [format_excess_bic(fit, orders) for fit in fits] == ["0.0", "5.5", "–"]

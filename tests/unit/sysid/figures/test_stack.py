@@ -11,13 +11,14 @@ from sysid.figures.data import (
     CorrelationTrace,
     ExperimentTraces,
     OutputTraces,
-    RunFigureData,
     SignalTrace,
 )
 from sysid.figures.plotly import Figure
 from sysid.figures.residuals import plot_residuals
 from sysid.figures.signals import plot_response
 from sysid.figures.stack import stack_figures
+from sysid.search.state import IslandSummary
+from sysid.uncertainty.estimates import CorrelationMatrix
 
 T = np.linspace(0.0, 1.0, 30)
 
@@ -36,21 +37,16 @@ def residuals() -> Figure:
     return plot_residuals([one, one])
 
 
-def search() -> RunFigureData:
-    return RunFigureData(
-        id="",
-        unit="bar",
-        islands=[(0.4, 0.3), (0.5, None)],
-        correlation={"names": ["K", "T"], "matrix": np.eye(2)},
-    )
+ISLANDS = [IslandSummary(0.4, 0.3, (), 1), IslandSummary(0.5, None, (), 1)]
+CORRELATION = CorrelationMatrix(("K", "T"), np.eye(2))
 
 
 def parts() -> list[tuple[str, Figure]]:
     return [
         ("Response", response()),
         ("Residuals", residuals()),
-        ("Correlation", plotly.plot_correlation(search())),
-        ("Waterfall", plotly.plot_waterfall(search())),
+        ("Correlation", plotly.plot_correlation(CORRELATION)),
+        ("Waterfall", plotly.plot_waterfall(ISLANDS, "bar")),
     ]
 
 

@@ -335,7 +335,7 @@ def test_whatever_the_seed_sections_are_given_in_one_order() -> None:
     data = Record((U,), (Channel("z", TIMES, clean + noise, "m"),))
     for seed in range(3):
         found = identify(posed.model, data, GeneticAlgorithm(islands=2), seed=seed)
-        values = {e.name: e.value for e in found.estimates}
+        values = {e.name: e.value for e in found.parameters}
         assert values["Kx"] == pytest.approx(4.0, abs=0.3)
         assert values["Ty"] == pytest.approx(0.4, abs=0.1)
         assert values["x(0)"] > values["y(0)"]
@@ -439,12 +439,12 @@ def test_whatever_the_seed_the_larger_comes_first_and_it_is_told() -> None:
         for seed in range(4)
     ]
     for one in found:
-        values = {e.name: e.value for e in one.estimates}
+        values = {e.name: e.value for e in one.parameters}
         assert values["T1"] == pytest.approx(1.5, abs=0.2)
         assert values["T2"] == pytest.approx(0.5, abs=0.2)
         assert any("T1 and T2 can be exchanged" in text for text in one.warnings)
         assert all(island.parameters[2] >= island.parameters[3] for island in one.islands)
-        for e in one.estimates:
+        for e in one.parameters:
             assert e.interval95 is not None
             assert e.interval95[1] - e.interval95[0] < 0.8
 

@@ -94,9 +94,9 @@ def test_a_run_that_is_late_has_a_whole_result_that_tells_what_was_left_out(
     late = conclude_run(problem, LIMITED, replace(state, seconds=1e9), clock=lambda: 0.0)
     assert [any(SAID in text for text in one.warnings) for one in (in_time, late)] == [False, True]
     assert late.rms <= state.rms
-    assert all(one.stderr is not None for one in late.estimates)
-    assert late.uncertainty is not None
-    assert late.residual_tests is not None
+    assert all(one.stderr is not None for one in late.parameters)
+    assert late.covariance is not None
+    assert late.residual_tests.tests
 
 
 def test_without_a_limit_no_clock_is_heard() -> None:
@@ -104,5 +104,5 @@ def test_without_a_limit_no_clock_is_heard() -> None:
     free = replace(LIMITED, stop=Stop())
     state = advance_run(problem, free, begin_run(problem, free, 1))
     found = conclude_run(problem, free, replace(state, seconds=1e9), clock=lambda: 1e12)
-    assert found.estimates == conclude_run(problem, free, state).estimates
+    assert found.parameters == conclude_run(problem, free, state).parameters
     assert not any(SAID in text for text in found.warnings)

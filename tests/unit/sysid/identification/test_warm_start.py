@@ -44,7 +44,7 @@ def found(record: Record, warm: dict[str, float] | None = None, seed: int = 1) -
 
 
 def values(one: Identification) -> dict[str, float]:
-    return {estimate.name: estimate.value for estimate in one.estimates}
+    return {estimate.name: estimate.value for estimate in one.parameters}
 
 
 def test_a_warm_start_halves_the_simulations_and_ends_at_the_same_result() -> None:
@@ -55,7 +55,7 @@ def test_a_warm_start_halves_the_simulations_and_ends_at_the_same_result() -> No
         warm = found(after, values(found(before, seed=seed)), seed=seed)
         spent["cold"] += cold.evaluations
         spent["warm"] += warm.evaluations
-        for one, other in zip(cold.estimates, warm.estimates, strict=True):
+        for one, other in zip(cold.parameters, warm.parameters, strict=True):
             if one.stderr is not None:
                 assert abs(one.value - other.value) <= 0.01 * one.stderr
     assert 2 * spent["warm"] <= spent["cold"]

@@ -145,7 +145,7 @@ def test_a_run_out_of_time_says_that_it_has_not_looked(monkeypatch: pytest.Monke
     late = conclude_run(problem, algorithm, replace(state, seconds=1e9))
     assert not any(said in text for text in in_time.warnings)
     assert any(said in text for text in late.warnings)
-    (start,) = refine_candidates(problem, [np.array([one.value for one in late.estimates])])
+    (start,) = refine_candidates(problem, [np.array([one.value for one in late.parameters])])
     assert start is not None
     scan = scan_parameters(problem, start, [problem.free_names.index("L")], 1800).evaluations
     archived = sum(len(read_archive(island.archive)) for island in state.islands)
@@ -160,7 +160,7 @@ def test_where_on_its_plateau_a_search_ends_says_nothing_of_a_rounded_lag() -> N
     found = []
     for seed in (1, 2, 3):
         result = identify(model, record(noisy()), seed=seed)
-        found.append(next(one for one in result.estimates if one.name == "L"))
+        found.append(next(one for one in result.parameters if one.name == "L"))
     first = found[0].interval95
     assert first is not None
     assert len({one.value for one in found}) > 1

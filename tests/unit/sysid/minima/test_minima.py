@@ -83,11 +83,11 @@ def record(u: FloatArray, first: int, seed: int = 1) -> Record:
 
 
 def status(found: Identification, name: str) -> str:
-    return next(one.status for one in found.estimates if one.name == name)
+    return next(one.status for one in found.parameters if one.name == name)
 
 
 def reason(found: Identification, name: str) -> str:
-    return next(one.reason for one in found.estimates if one.name == name)
+    return next(one.reason for one in found.parameters if one.name == name)
 
 
 def regenerate() -> tuple[Problem, FloatArray]:
@@ -131,7 +131,7 @@ def test_lags_a_period_apart_are_listed_where_the_start_is_skipped() -> None:
     assert status(found, "L") == "ambiguous"
     lags = sorted(one.values[2] for one in found.search.minima if one.is_compatible)
     assert lags == pytest.approx([LAG, LAG + PERIOD, LAG + 2 * PERIOD], abs=0.02)
-    (own,) = (one.value for one in found.estimates if one.name == "L")
+    (own,) = (one.value for one in found.parameters if one.name == "L")
     others = [lag for lag in lags if abs(lag - own) > 1]
     assert list_told(found) == pytest.approx(others, abs=0.01)
     assert {status(found, name) for name in "KT"} == {"identified"}
@@ -160,7 +160,7 @@ def test_lags_a_period_apart_are_listed_though_few_samples_are_skipped() -> None
 def test_a_lag_that_the_assumed_input_has_moved_is_told_with_its_value_without() -> None:
     draw = periodic_input(np.random.default_rng(62_001))
     found = identify(draw.model, draw.record, seed=1, loss=Loss(noise_model="white"))
-    (own,) = (one for one in found.estimates if one.name == "L")
+    (own,) = (one for one in found.parameters if one.name == "L")
     assert own.interval95 is not None
     assert not own.interval95[0] <= draw.truth <= own.interval95[1]
     lags = [draw.truth + k * draw.period for k in range(3)]
@@ -190,7 +190,7 @@ def test_a_record_that_begins_at_rest_tells_lags_a_period_apart() -> None:
 def test_an_input_without_a_period_tells_the_lag(skip: int) -> None:
     found = identify(lag_model(), record(steps(500), 200), skip=skip)
     assert status(found, "L") == "identified"
-    (own,) = (one for one in found.estimates if one.name == "L")
+    (own,) = (one for one in found.parameters if one.name == "L")
     assert own.stderr is not None
     assert abs(own.value - LAG) <= 4 * own.stderr + 0.1
 
@@ -200,7 +200,7 @@ def test_a_search_that_ends_too_early_says_that_it_did_not_settle() -> None:
     found = identify(load_model("duffing-eq16"), _duffing_record(), hurried)
     assert not found.search.settled
     assert found.search.because is None
-    assert "identified" not in {one.status for one in found.estimates}
+    assert "identified" not in {one.status for one in found.parameters}
     assert any(text.startswith("the search did not settle") for text in found.warnings)
 
 
@@ -213,7 +213,7 @@ def test_a_search_is_settled_by_starts_that_agree_or_by_residuals_that_are_noise
     quick = identify(load_model("duffing-eq16"), _duffing_record(), hurried)
     assert quick.search.agreeing_starts < 2
     assert quick.search.because == "residuals"
-    assert {one.status for one in quick.estimates} == {"identified"}
+    assert {one.status for one in quick.parameters} == {"identified"}
 
 
 def test_starts_count_only_if_they_ended_in_the_minimum_of_the_result() -> None:
@@ -234,7 +234,7 @@ def test_starts_count_only_if_they_ended_in_the_minimum_of_the_result() -> None:
             islands.append(replace(island, archive=archive, history=(champion,)))
         found = conclude_run(problem, search, replace(state, islands=tuple(islands)))
         assert found.search.agreeing_starts == agreeing
-        assert {one.name: one.value for one in found.estimates}["tau"] == pytest.approx(
+        assert {one.name: one.value for one in found.parameters}["tau"] == pytest.approx(
             truth[2], rel=1e-2
         )
 

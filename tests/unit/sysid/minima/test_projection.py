@@ -125,7 +125,7 @@ def test_a_budget_is_kept_and_a_small_one_draws_nothing() -> None:
 def test_the_bounds_of_a_catalogue_model_hide_no_lag(seed: int) -> None:
     """Residuals with a part of a disturbance: nothing shows that the search has found all."""
     found = identify(load_model("sopdt"), telegraph(colour=0.3), seed=seed)
-    (lag,) = (one for one in found.estimates if one.name == "L")
+    (lag,) = (one for one in found.parameters if one.name == "L")
     assert lag.value == pytest.approx(TRUTH["L"], abs=0.05)
     assert found.search.agreeing_starts >= 2
 

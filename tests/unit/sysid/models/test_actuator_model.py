@@ -134,7 +134,7 @@ def test_the_published_parameters_are_found_again_from_the_exact_plant() -> None
     measured = Channel("theta", TIMES, exact + noise, "rad")
     found = identify(load_model("actuator"), Record((given,), (measured,)), seed=1)
     assert found.rms == pytest.approx(1e-3, rel=0.1)
-    for estimate in found.estimates:
+    for estimate in found.parameters:
         if estimate.name in KNOWN_SPREAD:
             true = PUBLISHED[estimate.name]
             assert estimate.stderr is not None

@@ -108,7 +108,7 @@ def test_the_parameters_of_a_history_are_found_with_the_lag() -> None:
     noisy = clean + np.random.default_rng(3).normal(0, 0.01, times.size)
     small = sysid.GeneticAlgorithm(population=20, generations=30, islands=1)
     found = sysid.identify(model, [Record((), (Channel("y", times, noisy),))], small)
-    for estimate in found.estimates:
+    for estimate in found.parameters:
         assert estimate.stderr is not None
         assert abs(estimate.value - truth[estimate.name]) < 4 * estimate.stderr
 

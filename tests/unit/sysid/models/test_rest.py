@@ -187,7 +187,7 @@ def test_a_plant_at_rest_is_identified_without_a_start_to_estimate() -> None:
     noisy = replace(y, values=y.values + 0.01 * rng.normal(size=TIMES.size))
     found = identify(model, Record((u, q), (noisy,)), GeneticAlgorithm(generations=60))
     assert found.warnings == ()
-    for estimate, true in zip(found.estimates, (1.7, 0.6, 0.43), strict=True):
+    for estimate, true in zip(found.parameters, (1.7, 0.6, 0.43), strict=True):
         assert estimate.stderr is not None
         assert abs(estimate.value - true) < 4 * estimate.stderr < 0.1
 

@@ -118,7 +118,7 @@ def test_a_tie_is_identified_and_validated_with_the_rest() -> None:
         parameters={"a": {"tied": "c*b"}},
         validation_fraction=0.3,
     )
-    values = {estimate.name: estimate.value for estimate in found.estimates}
+    values = {estimate.name: estimate.value for estimate in found.parameters}
     assert values["a"] == pytest.approx(values["c"] * values["b"])
     assert values["a"] == pytest.approx(1.0, abs=0.2)
     assert found.rms_validation == pytest.approx(0.01, rel=0.3)

@@ -56,7 +56,7 @@ def test_the_volume_of_a_pipe_is_found_from_a_record_with_a_varying_flow() -> No
     noisy = clean + np.random.default_rng(2).normal(0, 0.01, TIMES.size)
     small = sysid.GeneticAlgorithm(population=20, generations=40, islands=1)
     found = sysid.identify(piped(), [record(FLOW, noisy)], small)
-    for estimate in found.estimates:
+    for estimate in found.parameters:
         assert estimate.stderr is not None
         assert abs(estimate.value - truth[estimate.name]) < 4 * estimate.stderr
     # The flow swings by a factor of three: a constant lag cannot do that.

@@ -136,8 +136,8 @@ def test_estimates_under_slow_noise_do_not_depend_on_the_inputs_unit(unit: float
     bounds = {"g": {"lower": -10.0 / unit, "upper": 10.0 / unit}}
     found = identify(load_model(GAIN), [data], SMALL, seed=1, loss=AR1, skip=1)
     same = identify(load_model(GAIN), [other], SMALL, seed=1, loss=AR1, skip=1, parameters=bounds)
-    g, m = (one.value for one in found.estimates)
-    assert tuple(one.value for one in same.estimates) == (g / unit, m)
+    g, m = (one.value for one in found.parameters)
+    assert tuple(one.value for one in same.parameters) == (g / unit, m)
     assert same.correlation_times == found.correlation_times
 
 
@@ -156,10 +156,10 @@ def test_intervals_under_first_order_noise_hold_the_truth() -> None:
     held, deviations, colours = [], [], []
     for seed in draw_seeds(gate=12, night=200):
         found = identify(load_model(GAIN), record(seed, 0.9), SMALL, loss=AR1, skip=1, seed=seed)
-        assert found.uncertainty is not None
-        colours.append(found.uncertainty.noise_colour)
-        deviations.append(found.uncertainty.noise_sd)
-        for one, true in zip(found.estimates, (2.0, 1.0), strict=True):
+        assert found.noise_sd is not None
+        colours.append(found.noise_colour)
+        deviations.append(found.noise_sd)
+        for one, true in zip(found.parameters, (2.0, 1.0), strict=True):
             assert one.interval95 is not None
             held.append(one.interval95[0] <= true <= one.interval95[1])
     others = sum(colour != "first-order" for colour in colours)
@@ -194,7 +194,7 @@ def test_white_residuals_leave_everything_as_it_is() -> None:
         identify(load_model(GAIN), record(3, 0.0), SMALL, loss=loss, skip=1)
         for loss in (Loss(), AR1)
     )
-    assert [replace(one) for one in found.estimates] == list(plain.estimates)
+    assert [replace(one) for one in found.parameters] == list(plain.parameters)
     assert not found.correlation_times
     assert any("consistent with white noise" in text for text in found.warnings)
 
@@ -207,11 +207,11 @@ def test_of_a_rough_loss_intervals_hold_the_minima_that_the_noise_does_not_rule_
         problem, settings, advance_run(problem, settings, begin_run(problem, settings, 1))
     )
     assert found.correlation_times["y"] > 0
-    theta = np.array([one.value for one in found.estimates])
+    theta = np.array([one.value for one in found.parameters])
     white = make_whitening(problem, found.correlation_times)
     wider = []
     for one, alone in zip(
-        found.estimates, analyse_estimate(problem, theta, None, white).estimates, strict=True
+        found.parameters, analyse_estimate(problem, theta, None, white).estimates, strict=True
     ):
         assert one.interval95 is not None
         assert alone.interval95 is not None
@@ -245,7 +245,7 @@ def test_a_noise_model_gets_the_time_that_is_left_and_no_more(
         True,
     ]
     assert late.evaluations <= whole.evaluations - 50
-    assert conclude_run(problem, timed, replace(state, seconds=1.0)).estimates == whole.estimates
+    assert conclude_run(problem, timed, replace(state, seconds=1.0)).parameters == whole.parameters
 
 
 def test_what_a_noise_model_cannot_do_is_refused() -> None:

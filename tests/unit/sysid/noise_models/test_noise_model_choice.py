@@ -12,7 +12,7 @@ from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
 from sysid.noise_models.noise_model_choice import compare_on_blocks
-from sysid.results.result import Identification
+from sysid.results.identification import Identification
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.profile_likelihood import compute_profile
 from tests.models import LINE
@@ -80,7 +80,7 @@ def found(model: dict[str, Any], y: FloatArray, loss: Loss, **options: Any) -> I
 def same(one: Identification, other: Identification) -> bool:
     """Whether all numbers of two results are equal, bit for bit."""
     return (
-        one.estimates == other.estimates
+        one.parameters == other.parameters
         and (one.rms, one.criteria) == (other.rms, other.criteria)
         and one.evaluations == other.evaluations
         and one.correlation_times == other.correlation_times
@@ -93,12 +93,12 @@ def test_a_drift_of_an_integrator_is_taken_for_noise_and_squares_are_told(seed: 
     y = disturbed(seed)
     auto, white, ar1 = (found(TANK, y, loss) for loss in (AUTO, WHITE, AR1))
     assert auto.noise_model == "ar1"
-    assert auto.estimates == ar1.estimates
+    assert auto.parameters == ar1.parameters
     assert auto.correlation_times == ar1.correlation_times
-    assert auto.estimates != white.estimates
+    assert auto.parameters != white.parameters
     (note,) = set(auto.warnings) - set(ar1.warnings)
     assert "loss=Loss(noise_model='white')" in note
-    for one in white.estimates:
+    for one in white.parameters:
         assert f"{one.name} = {one.value:.4g}" in note
 
 
@@ -106,7 +106,7 @@ def test_a_drift_of_an_integrator_is_taken_for_noise_and_squares_are_told(seed: 
 def test_dynamics_that_the_model_lacks_are_left_to_squares(seed: int) -> None:
     auto, white, ar1 = (found(LAG, delayed(seed), loss) for loss in (AUTO, WHITE, AR1))
     assert ar1.correlation_times["y"] > 0
-    assert auto.estimates == white.estimates
+    assert auto.parameters == white.parameters
     assert auto.warnings == white.warnings
     assert auto.noise_model == "white"
 
@@ -135,12 +135,12 @@ def test_validation_data_decide_where_there_are_any() -> None:
     y = disturbed(2)
     white, ar1 = (found(TANK, y, loss) for loss in (WHITE, AR1))
     for better in (white, ar1):
-        values = [one.value for one in better.estimates]
+        values = [one.value for one in better.parameters]
         problem = Problem.build(load_model(TANK), [record(y)])
         other = record(problem.predict(np.array([values]))[0])
         auto = found(TANK, y, AUTO, validation=other)
         assert auto.noise_model == better.noise_model
-        assert auto.estimates == found(TANK, y, better_loss(better), validation=other).estimates
+        assert auto.parameters == found(TANK, y, better_loss(better), validation=other).parameters
 
 
 def better_loss(found: Identification) -> Loss:
@@ -189,7 +189,7 @@ def test_too_long_a_step_of_the_integration_is_told_and_not_taken_for_noise() ->
 def test_a_budget_that_does_not_suffice_leaves_squares(most: int) -> None:
     tight = replace(SMALL, stop=Stop(evaluations=most, settled=None))
     auto, white = (found(TANK, disturbed(2), loss, settings=tight) for loss in (AUTO, WHITE))
-    assert auto.estimates == white.estimates
+    assert auto.parameters == white.parameters
     assert auto.warnings == white.warnings
     assert auto.evaluations <= most
 

@@ -136,8 +136,7 @@ def test_a_result_says_that_its_errors_are_by_repeat_and_stays_in_the_bounds() -
     found = identify(
         LINE, pool(draw_repeats(8, 3)), parameters={"b": {"lower": 0.97, "upper": 1.5}}
     )
-    assert found.uncertainty is not None
-    assert found.uncertainty.noise_colour == "clustered"
+    assert found.noise_colour == "clustered"
     interval = found["b"].interval95
     assert interval is not None
     assert interval[0] >= 0.97

@@ -262,7 +262,7 @@ def test_the_true_model_passes_and_one_with_another_lag_fails() -> None:
     whole = run_residual_tests(true, clean, "estimation")
     assert isinstance(whole, ResidualTests)
     assert whole.passed is True
-    assert [(one.kind, one.input) for one in whole.tests] == [
+    assert [(one.test, one.input) for one in whole.tests] == [
         ("whiteness", None),
         ("independence", "u"),
     ]

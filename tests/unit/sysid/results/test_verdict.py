@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from sysid.residuals.residual_tests import ResidualTest
-from sysid.results.result import OrderComparison, OrderFit, SearchEvidence
+from sysid.results.parts import OrderComparison, OrderFit, SearchEvidence, compare_fits
 from sysid.results.verdict import Evidence, judge_result
 from sysid.simulation.metrics import ChannelMetrics
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
@@ -158,7 +158,7 @@ def orders(*bics: float) -> OrderComparison:
         OrderFit(name, place, delay, 0.01, {"L": delay}, 0.02, bic)
         for place, (name, delay, bic) in enumerate(zip(names, delays, bics, strict=False), 1)
     )
-    return OrderComparison("fopdt", "L", "s", "white", tuple(fits))
+    return compare_fits("fopdt", "L", "s", "white", tuple(fits))
 
 
 def test_an_order_that_the_data_prefer_limits_the_trust_and_names_its_lag() -> None:

@@ -1,5 +1,6 @@
 """Selecting a polynomial's terms on records: what is chosen, on which rows, at which lags."""
 
+import re
 from dataclasses import replace
 from itertools import combinations, product
 
@@ -7,11 +8,11 @@ import numpy as np
 import pytest
 
 from service.models.models import apply_result
-from service.pages.diagnostics import to_diagnostics
+from service.pages.render import template_environment
 from sysid.core.errors import InvalidSettings
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.models.model import TermRule
+from sysid.models.model import SelectedTerm, TermRule
 from sysid.models.parse import parse_model
 from sysid.selection.frols import exchange_terms, rate_terms, select_forward, solve_coefficients
 from sysid.selection.lag_search import search_lags
@@ -19,6 +20,7 @@ from sysid.selection.regression import Regression
 from sysid.selection.select import select_model_terms
 from sysid.simulation.problem import Problem
 from tests.polynomials import LAGGED, TRUTH, document, frols, lagged, record_of
+from tests.results import conclude
 
 
 def chosen(terms: object, *records: Record, **changes: object) -> dict[str, float]:
@@ -326,11 +328,13 @@ def test_every_pair_of_terms_can_be_asked_for_as_candidates() -> None:
 
 
 def test_pages_show_the_selected_terms_in_their_order() -> None:
-    first = {"term": "y(k-1)", "err": 0.583, "cumulated": 0.583, "coefficient": 1.5}
-    second = {"term": "u(k-1)", "err": 0.417, "cumulated": 1.0 + 1e-16, "coefficient": 0.5}
-    found = to_diagnostics({"selection": [first, second]}).selection
-    assert [(one.term, one.err, one.unexplained) for one in found] == [
-        ("y(k-1)", "0.5830", "0.4170"),
-        ("u(k-1)", "0.4170", "0"),
+    first = SelectedTerm("y(k-1)", 0.583, 0.583, 1.5)
+    second = SelectedTerm("u(k-1)", 0.417, 1.0 + 1e-16, 0.5)
+    chosen = replace(conclude().identification, selection=(first, second))
+    parts = template_environment().get_template("parts.html").module
+    rows = re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', parts.findings(chosen))  # type: ignore[attr-defined]
+    assert [(term, re.findall(r">([^<]+)</td>", cells)) for term, cells in rows] == [
+        ("y(k-1)", ["0.5830", "0.4170"]),
+        ("u(k-1)", ["0.4170", "0"]),
     ]
-    assert to_diagnostics({}).selection == []
+    assert "Selected term" not in parts.findings(conclude().identification)  # type: ignore[attr-defined]

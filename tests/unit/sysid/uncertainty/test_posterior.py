@@ -76,7 +76,7 @@ def test_a_linear_model_has_the_multivariate_t_distribution() -> None:
     n = 14
     problem = pose(white(n))
     posterior, analysis = sample(problem)
-    assert posterior.is_converged
+    assert posterior.converged
     assert describe_posterior(posterior, analysis.estimates) == []
     far = [replace(one, interval95=(-9.0, 9.0)) for one in analysis.estimates]
     (told,) = describe_posterior(posterior, far)
@@ -93,7 +93,7 @@ def test_a_linear_model_has_the_multivariate_t_distribution() -> None:
     assert np.all(np.abs(np.mean(samples, axis=0) - mean) < error * deviation)
     np.testing.assert_allclose(np.std(samples, axis=0), deviation, rtol=0.08)
     expected = covariance[0, 1] / np.prod(deviation)
-    assert posterior.correlation[0, 1] == pytest.approx(expected, abs=0.05)
+    assert posterior.correlation.matrix[0, 1] == pytest.approx(expected, abs=0.05)
     assert np.all(np.abs(compare_intervals(posterior, analysis)) < 0.03)
     medians = np.array([parameter.median for parameter in posterior.parameters])
     assert np.all(np.abs(medians - mean) < 0.1 * deviation)
@@ -150,10 +150,11 @@ def test_intervals_of_example_1_are_those_of_the_standard_errors() -> None:
     theta = refine(problem, 0.2, 0.5, 5.0, 1.0)
     analysis = analyse_estimate(problem, theta)
     posterior = sample_posterior(problem, theta, analysis, [], 1)
-    assert posterior.is_converged
+    assert posterior.converged
     assert np.all(np.abs(compare_intervals(posterior, analysis)) < 0.05)
     assert analysis.uncertainty is not None
-    np.testing.assert_allclose(posterior.correlation, analysis.uncertainty.correlation, atol=0.06)
+    expected = analysis.uncertainty.correlation
+    np.testing.assert_allclose(posterior.correlation.matrix, expected, atol=0.06)
 
 
 def pose_periodic() -> Problem:
@@ -178,7 +179,7 @@ def test_walkers_move_between_two_minima_that_fit_as_well() -> None:
     ends = [refine(problem, 2.0, lag) for lag in (1.3, 6.3)]
     analysis = analyse_estimate(problem, ends[0])
     posterior = sample_posterior(problem, ends[0], analysis, ends, 1)
-    assert posterior.is_converged
+    assert posterior.converged
     share = np.mean(posterior.samples[:, 1] > 4.0)
     assert 0.4 < share < 0.6
     alone = sample_posterior(problem, ends[0], analysis, [], 1, 2000)
@@ -205,7 +206,7 @@ def test_a_cut_chain_says_so_and_equal_seeds_give_equal_bits() -> None:
     problem = pose(white(14))
     posterior, _ = sample(problem, max_simulations=2000)
     assert posterior.evaluations <= 2000
-    assert not posterior.is_converged
+    assert not posterior.converged
     assert "the limit of simulations ended it" in posterior.reason
     (text,) = describe_posterior(posterior)
     assert text.startswith("the samples of the posterior have not converged")

@@ -1,0 +1,207 @@
+"""Parts of a result: minima and how far the search is to be trusted, holds, orders of a process."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from sysid.core.types import FloatArray
+from sysid.data.holds import Hold
+
+CHI_SQUARE_95 = 3.841
+"""Quantile of χ² with one degree of freedom."""
+STRONG_EVIDENCE = 6.0
+"""Difference of BIC: odds of 20 to 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Minimum:
+    """A minimum of the loss.
+
+    Attributes
+    ----------
+    parameters : mapping of str to float
+        Values of the free parameters, in their units.
+    rms : float
+        RMS error, in the unit of the result's `rms`.
+    count : int
+        How many least-squares fits ended in it, in the search and after it.
+    independent : int
+        How many of them began at random points.
+    likelihood_ratio : float
+        n ln(Σe²/Σe²₀) to the best minimum, twice the logarithm of the ratio of likelihoods, made
+        smaller for coloured residuals.
+    is_compatible : bool
+        Whether the data do not rule it out.
+    recorded_from : float or None
+        Compared from this time of each record on, s, where the input is recorded; none: all of it.
+    """
+
+    parameters: Mapping[str, float]
+    rms: float
+    count: int
+    independent: int
+    likelihood_ratio: float
+    is_compatible: bool
+    recorded_from: float | None = None
+
+    @property
+    def values(self) -> FloatArray:
+        """Values of the free parameters (D,)."""
+        return np.array([*self.parameters.values()])
+
+
+@dataclass(frozen=True, slots=True)
+class SearchEvidence:
+    """What a result knows of the whole search.
+
+    Attributes
+    ----------
+    settled : bool
+        Whether the search settled.
+    because : {"starts", "residuals"} or None
+        What shows it; none if nothing does.
+    independent_starts : int
+        Local searches from random points.
+    agreeing_starts : int
+        How many of them ended in the best minimum.
+    minima : tuple of Minimum
+        Minima in which least squares ended after the search, the lowest first.
+    """
+
+    settled: bool
+    because: Literal["starts", "residuals"] | None
+    independent_starts: int
+    agreeing_starts: int
+    minima: tuple[Minimum, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class InputHold:
+    """How an input is read between its samples.
+
+    Attributes
+    ----------
+    input : str
+        Input of the model.
+    chosen : {"zero", "first", "band-limited"}
+        How it was read.
+    reason : str or None
+        Reason of a choice by the values; none if the hold was given.
+    other : {"zero", "first"} or None
+        The reading that was not chosen; none if the hold was given or has no effect.
+    estimates_other : mapping of str to float, or None
+        Estimates of the free parameters with the other reading, from the estimates by least
+        squares, in their units; none if they were not computed.
+    rms_other : float or None
+        RMS error with the other reading, in the unit of the result's `rms`.
+    """
+
+    input: str
+    chosen: Hold
+    reason: str | None
+    other: Hold | None = None
+    estimates_other: Mapping[str, float] | None = None
+    rms_other: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class OrderFit:
+    """A process of one order, fitted to the samples of an identification.
+
+    Attributes
+    ----------
+    model : str
+        Its name in the catalogue.
+    order : int
+        Number of poles.
+    delay : float
+        Dead time, in the comparison's `unit`.
+    delay_stderr : float or None
+        Standard error of the dead time, in the same unit.
+    values : mapping of str to float
+        All parameters of that model, in their units.
+    rms : float
+        RMS error, in the unit of the result's `rms`.
+    bic : float
+        Schwarz's criterion, smaller is better; with the noise model of the comparison.
+    is_open : bool
+        Whether its BIC is within 6 of the lowest: no strong evidence against it.
+    """
+
+    model: str
+    order: int
+    delay: float
+    delay_stderr: float | None
+    values: Mapping[str, float]
+    rms: float
+    bic: float
+    is_open: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class OrderComparison:
+    """The model's order, one order less and one more, fitted to the same samples.
+
+    Attributes
+    ----------
+    model : str
+        The catalogue's name of the model's own order.
+    preferred_model : str or None
+        The one order that is open; none if there are several.
+    delay : str
+        The model's parameter that is the dead time.
+    unit : str
+        Unit of the dead times.
+    delay_range : tuple of float
+        Smallest and largest dead time of the open orders, in `unit`.
+    noise_model : {"white", "ar1"}
+        Noise model of the criteria.
+    fits : tuple of OrderFit
+        The orders, the lowest first.
+    """
+
+    model: str
+    preferred_model: str | None
+    delay: str
+    unit: str
+    delay_range: tuple[float, float]
+    noise_model: Literal["white", "ar1"]
+    fits: tuple[OrderFit, ...]
+
+    @property
+    def own_fit(self) -> OrderFit:
+        """The fit of the model's own order."""
+        return next(fit for fit in self.fits if fit.model == self.model)
+
+    @property
+    def open_fits(self) -> tuple[OrderFit, ...]:
+        """The orders without strong evidence against them."""
+        return tuple(fit for fit in self.fits if fit.is_open)
+
+
+def compare_fits(
+    model: str,
+    delay: str,
+    unit: str,
+    noise_model: Literal["white", "ar1"],
+    fits: Sequence[OrderFit],
+) -> OrderComparison:
+    """Compare fitted orders by their BIC: which are open, and which one is preferred.
+
+    Examples
+    --------
+    >>> first = OrderFit("fopdt", 1, 1.57, 0.01, {"L": 1.57}, 0.027, -1264.0)
+    >>> second = OrderFit("sopdt", 2, 1.33, 0.01, {"L": 1.33}, 0.019, -1474.0)
+    >>> comparison = compare_fits("fopdt", "L", "s", "white", (first, second))
+    >>> comparison.preferred_model, comparison.delay_range
+    ('sopdt', (1.33, 1.33))
+    """
+    limit = min(fit.bic for fit in fits) + STRONG_EVIDENCE
+    judged = tuple(replace(fit, is_open=fit.bic <= limit) for fit in fits)
+    open_fits = [fit for fit in judged if fit.is_open]
+    delays = [fit.delay for fit in open_fits]
+    preferred = open_fits[0].model if len(open_fits) == 1 else None
+    ends = (min(delays), max(delays))
+    return OrderComparison(model, preferred, delay, unit, ends, noise_model, judged)
