@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, WordArray
-from sysid.kernels.borrowing import borrow
+from sysid.kernels.borrowing import compile_borrowing
 from sysid.search.archive import archive_end
 from sysid.search.basin_hopping import (
     COUNTED_HOP,
@@ -59,12 +59,11 @@ SCATTER_TURN, GROWTH_TURN = 2, 4  # turns: of four to scatter, of eight to grow 
 SHORT_GROWTH = 1.5  # doublings: near the champion the later signs of velocities are right
 
 
-@jit_compile
+@compile_borrowing
 def _draw_best_start(
     evaluator: Evaluator, plan: IslandPlan, shape: tuple[int, int], search: SearchRecord
 ) -> FloatArray:
     """Draw random points and return the one that fits the record best up to the horizon."""
-    evaluator, plan = borrow((evaluator, plan))
     places, horizon = np.empty(shape), search.horizon
     for p in range(shape[0]):
         for d in range(shape[1]):
@@ -167,10 +166,9 @@ def _choose_start(plan: IslandPlan, size: int, is_lost: bool, search: SearchReco
     return chosen if chosen < size else 0
 
 
-@jit_compile
+@compile_borrowing
 def start_local_search(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
     """Choose the start of a local search, and the part of the record that it fits first."""
-    evaluator, plan, island = borrow((evaluator, plan, island))
     chromosomes, search = island.chromosomes, island.search
     search.local_searches += 1
     search.in_sequence_search, search.step_count, search.failed_steps = 1, 0, 0
@@ -196,10 +194,9 @@ def start_local_search(evaluator: Evaluator, plan: IslandPlan, island: IslandArr
         hop_from_champion(evaluator, plan, island)
 
 
-@jit_compile
+@compile_borrowing
 def _replace_individual(island: IslandArrays, chromosome: WordArray, reached: float) -> None:
     """Replace the individual that the search started from, or else the worst one."""
-    island, chromosome = borrow((island, chromosome))
     chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
     index = fitness.size - 1
     for p in range(fitness.size - 1, -1, -1):
@@ -213,12 +210,11 @@ def _replace_individual(island: IslandArrays, chromosome: WordArray, reached: fl
         search.replaced_fitness = reached
 
 
-@jit_compile
+@compile_borrowing
 def _scatter_population(
     island: IslandArrays, proposals: WordArray, reached: FloatArray, best: int
 ) -> None:
     """Replace all individuals but the champion by the probes; the genetic search continues."""
-    island, proposals, reached = borrow((island, proposals, reached))
     chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
     if search.probe_count < fitness.size:  # probes of a growing horizon stay for the next step
         return
@@ -260,12 +256,11 @@ def _extend_horizon(search: SearchRecord, champion: float) -> None:
         search.confirmed_starts += search.reached_fitness <= champion * (1.0 + SAME_OPTIMUM)
 
 
-@jit_compile
+@compile_borrowing
 def _finish_part(
     evaluator: Evaluator, plan: IslandPlan, island: IslandArrays, reached: float
 ) -> None:
     """Extend the horizon; end early if a far search near jumps is behind the champion."""
-    evaluator, plan, island = borrow((evaluator, plan, island))
     search = island.search
     races = search.horizon < 1.0 and search.fitness_discontinuities > 0 and search.hop_kind == 0
     if races and is_behind_champion(evaluator, plan, island, search.horizon, reached):
@@ -279,12 +274,11 @@ def _finish_part(
         search.champion_explained = is_champion_explained(evaluator, plan, island)
 
 
-@jit_compile
+@compile_borrowing
 def _propose_places(
     plan: IslandPlan, island: IslandArrays, matrix: FloatArray, gradient: FloatArray, base: float
 ) -> FloatArray:
     """Propose steps of several dampings, and probes drawn from the estimate's covariance."""
-    plan, island, matrix, gradient = borrow((plan, island, matrix, gradient))
     point, search = island.point, island.search
     places = np.empty((N_TRIALS + search.probe_count, point.size))
     for t in range(N_TRIALS):
@@ -300,10 +294,9 @@ def _propose_places(
     return places
 
 
-@jit_compile
+@compile_borrowing
 def run_adaptive_sequence(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
     """Run one generation of the adaptive search: sensitivities, then several steps at once."""
-    evaluator, plan, island = borrow((evaluator, plan, island))
     point, search = island.point, island.search
     horizon = search.horizon
     search.step_count += 1

@@ -20,7 +20,7 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
-from sysid.kernels.borrowing import borrow
+from sysid.kernels.borrowing import compile_borrowing
 from sysid.search.levenberg_marquardt import factor_damped, write_spread_place
 from sysid.search.operators import (
     USE_LOCAL_SEARCH,
@@ -58,7 +58,7 @@ def find_odd_increment(losses: FloatArray) -> tuple[int, float]:
     return index, largest
 
 
-@jit_compile
+@compile_borrowing
 def _evaluate_line(
     evaluator: Evaluator,
     factor: FloatArray,
@@ -69,7 +69,6 @@ def _evaluate_line(
     largest_loss: float,
 ) -> FloatArray:
     """Evaluate the squared fitness, limited to `largest_loss`, at equal distances on a line."""
-    evaluator, factor, point, direction = borrow((evaluator, factor, point, direction))
     places, deviation = np.empty((LINE_PLACES, point.size)), np.empty(point.size)
     for p in range(LINE_PLACES):
         for d in range(point.size):
@@ -80,7 +79,7 @@ def _evaluate_line(
     )
 
 
-@jit_compile
+@compile_borrowing
 def has_discontinuity(
     evaluator: Evaluator,
     factor: FloatArray,
@@ -102,7 +101,6 @@ def has_discontinuity(
     search : SearchRecord
         Search record of the island, which counts the simulations.
     """
-    evaluator, factor, point, direction = borrow((evaluator, factor, point, direction))
     first, width, before, upper_loss = -LINE_REACH, 2.0 * LINE_REACH, 0.0, 0.0
     variance, largest_loss = base**2 / evaluator.n_scored, _HIGH_LOSS * base**2
     for level in range(_ZOOM_LEVELS):
@@ -127,10 +125,9 @@ PROBED_HOPS = 4  # hops that also test for jumps of the fitness, until there is 
 LINES_PER_HOP = 2  # lines that each of them tests
 
 
-@jit_compile
+@compile_borrowing
 def hop_from_champion(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
     """Move the point away from the champion, along the covariance or in one parameter."""
-    evaluator, plan, island = borrow((evaluator, plan, island))
     point, search = island.point, island.search
     search.evaluations += point.size + 1
     difference = choose_difference(plan, search)
@@ -174,12 +171,11 @@ def _draw_deviation(
     return drawn
 
 
-@jit_compile
+@compile_borrowing
 def _probe_discontinuities(
     evaluator: Evaluator, plan: IslandPlan, factor: FloatArray, base: float, island: IslandArrays
 ) -> None:
     """Record whether the fitness jumps on lines through the point; not at the end of a budget."""
-    evaluator, plan, factor, island = borrow((evaluator, plan, factor, island))
     point, search = island.point, island.search
     for line in range(1, LINES_PER_HOP + 1):
         if (
