@@ -136,7 +136,7 @@ def _record_champion(
     log.improvement_islands[log.counts[0]] = island
     log.counts[0] += 1
     write_improvement(search, fitness, PHASE_MIGRATION, values, row)
-    search.stagnation, search.champion_converged = 0, 0
+    search.stagnation, search.champion_converged = 0, False
     reset_evidence(search, fitness, packed.champion_rms[island])
     packed.champion_rms[island] = fitness
     for d in range(values.size):

@@ -73,7 +73,7 @@ def count_restarts(rms: FloatArray, search: SearchArray) -> RestartCounts:
             hops += search[i].hop_count
             returned += search[i].returned_hops
             has_discontinuities |= search[i].champion_discontinuities > 0
-            is_explained |= search[i].champion_explained > 0
+            is_explained |= search[i].champion_explained
     return RestartCounts(independent, confirmed, hops, returned, has_discontinuities, is_explained)
 
 

@@ -29,14 +29,16 @@ def compile_borrowing(function: _Function) -> _Function:
     return jit_compile(function, _BorrowingCompiler)
 
 
-@intrinsic
-def _borrow(typing_context: Any, value: Any) -> Any:
+def _type_borrow(typing_context: Any, value: Any) -> Any:
     """Return an array, or a tuple with its arrays, without counts."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         return _drop_counts(context, builder, value, values[0])
 
     return value(value), generate
+
+
+_borrow: Any = intrinsic(_type_borrow)
 
 
 def _drop_counts(context: Any, builder: Any, kind: Any, value: Any) -> Any:
@@ -56,7 +58,7 @@ def _drop_counts(context: Any, builder: Any, kind: Any, value: Any) -> Any:
 
 
 @register_pass(mutates_CFG=False, analysis_only=False)
-class _BorrowArguments(FunctionPass):
+class _BorrowArguments(FunctionPass):  # type: ignore[misc]
     """Write ``x = borrow(x)`` for each argument at the head of a function."""
 
     _name = "borrow_arguments"
@@ -94,7 +96,7 @@ def _borrow_argument(statement: Any, scope: Any, kinds: Any) -> list[Any]:
     ]
 
 
-class _BorrowingCompiler(CompilerBase):
+class _BorrowingCompiler(CompilerBase):  # type: ignore[misc]
     """Numba's compiler, with borrowed arguments."""
 
     def define_pipelines(self) -> list[Any]:

@@ -30,6 +30,7 @@ from sysid.search.operators import (
     to_normal,
     to_uniform,
 )
+from sysid.search.schedule import HOP_IN_ONE_PARAMETER
 from sysid.search.slopes import build_normal_equations, choose_difference, evaluate_partial_fitness
 from sysid.search.state import IslandArrays, IslandPlan, SearchRecord
 from sysid.simulation.evaluator import Evaluator, evaluate_population, predict_partially
@@ -118,8 +119,6 @@ def has_discontinuity(
 
 
 MIN_HOP, MAX_HOP = 0.3, 50.0  # standard errors
-# Bits of a kind of hop: counted as evidence for the champion, not counted, of one parameter.
-COUNTED_HOP, UNCOUNTED_HOP, SINGLE_PARAMETER_HOP = 1, 2, 4
 SINGLE_HOP_FACTOR = 10.0  # one parameter moves so much farther, in its conditional standard errors
 PROBED_HOPS = 4  # hops that also test for jumps of the fitness, until there is one
 LINES_PER_HOP = 2  # lines that each of them tests
@@ -135,9 +134,9 @@ def hop_from_champion(evaluator: Evaluator, plan: IslandPlan, island: IslandArra
     word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, 0)
     size = base * MIN_HOP * (MAX_HOP / MIN_HOP) ** to_uniform(word[0])
     factor = factor_damped(matrix, gradient, point, 0.0)
-    if search.hop_kind & COUNTED_HOP:
+    if search.hop_is_evidence:
         _probe_discontinuities(evaluator, plan, factor, base, island)
-    if search.hop_kind & SINGLE_PARAMETER_HOP:
+    if search.hop == HOP_IN_ONE_PARAMETER:
         _move_single_parameter(plan, search, matrix, SINGLE_HOP_FACTOR * size, point)
     else:
         write_spread_place(factor, point, _draw_deviation(plan, search, 0, size, point.size), point)
@@ -188,7 +187,7 @@ def _probe_discontinuities(
             jumps = has_discontinuity(evaluator, factor, point, direction, base, search)
             search.champion_discontinuities += jumps
             # A warm start needs fewer agreeing restarts, a number chosen for smooth fitness.
-            search.fitness_discontinuities += jumps and search.is_warm_start == 0
+            search.fitness_discontinuities += jumps and not search.is_warm_start
 
 
 COLOUR_THRESHOLD = 0.5  # correlation of neighbouring residuals: noise has 0, a wrong response 1

@@ -5,13 +5,7 @@ import numpy as np
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, IntArray, WordArray
 from sysid.kernels.borrowing import compile_borrowing
-from sysid.search.adaptive_search import (
-    EARLY_SEARCHES,
-    N_TRIALS,
-    has_scattered,
-    run_adaptive_sequence,
-    start_local_search,
-)
+from sysid.search.adaptive_search import N_TRIALS, run_adaptive_sequence, start_local_search
 from sysid.search.known_fitness import recall_fitness, remember_fitness
 from sysid.search.operators import (
     USE_CHILDREN,
@@ -30,6 +24,7 @@ from sysid.search.operators import (
     to_integer,
     to_uniform,
 )
+from sysid.search.schedule import EARLY_SEARCHES, has_scattered
 from sysid.search.sequence_search import run_fixed_sequence
 from sysid.search.state import (
     COLUMN_EVALUATIONS,
@@ -263,7 +258,7 @@ def _switch_phase(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) 
         if is_early or hops_next or search.step_count >= max(1, plan.stagnation // 10):
             start_local_search(evaluator, plan, island)
     elif search.stagnation >= plan.stagnation:
-        search.in_sequence_search, search.stagnation = 1, 0
+        search.in_sequence_search, search.stagnation = True, 0
 
 
 @jit_compile
@@ -290,7 +285,7 @@ def reset_evidence(search: SearchRecord, rms: float, before: float) -> None:
     """Reset the evidence for the champion if the new one is another optimum."""
     if rms < before * (1.0 - SAME_OPTIMUM):
         search.confirmed_starts, search.champion_discontinuities = 0, 0
-        search.hop_count, search.returned_hops, search.champion_explained = 0, 0, 0
+        search.hop_count, search.returned_hops, search.champion_explained = 0, 0, False
 
 
 @jit_compile
@@ -336,7 +331,7 @@ def run_generations(
             search.stagnation = 0
             reset_evidence(search, fitness[0], best)
             if phase == PHASE_GENETIC:
-                search.champion_converged = 0
+                search.champion_converged = False
             _record_improvement(evaluator, plan, island, phase, improvements[written])
             written += 1
     return written

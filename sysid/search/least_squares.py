@@ -41,14 +41,14 @@ _STEPS_PER_CALL = 10_000_000  # steps of integration or recursion in one compile
 
 
 class _Progress(Protocol):
-    """Progress of a search. Fields that read as statements are 0 or 1."""
+    """Progress of a search."""
 
     loss: float  # at the present point
     damping: float
     idle_steps: int  # consecutive steps that gained almost nothing
-    has_jacobian: int  # the slopes are those of the present point
+    has_jacobian: bool  # the slopes are those of the present point
     evaluations: int
-    has_ended: int
+    has_ended: bool
 
 
 _PROGRESS = make_record_dtype(_Progress)
@@ -189,12 +189,12 @@ def _take_step(scored: ScoredSamples, descent: _Descent, scale: float, tolerance
     place, progress = descent.place, descent.progress
     if not progress.has_jacobian:
         fill_jacobian(scored, place, descent.error, descent.columns)
-        progress.has_jacobian = 1
+        progress.has_jacobian = True
         progress.evaluations += place.size
     tried = np.maximum(_DAMPINGS * progress.damping, _MIN_DAMPING)
     places, promised = _propose_places(descent, tried, scale)
     if promised <= tolerance * progress.loss:
-        progress.has_ended = 1
+        progress.has_ended = True
         return
     errors = compute_residuals(scored, places)
     progress.evaluations += N_TRIED
@@ -205,7 +205,7 @@ def _take_step(scored: ScoredSamples, descent: _Descent, scale: float, tolerance
         return
     gained = (progress.loss - value) / progress.loss
     place[:], descent.error[:] = places[best], errors[best]
-    progress.loss, progress.has_jacobian = value, 0
+    progress.loss, progress.has_jacobian = value, False
     damping = tried[best] if best > 0 else progress.damping * 1e-2
     progress.damping = min(max(damping, _MIN_DAMPING), _MAX_DAMPING)
     progress.idle_steps = progress.idle_steps + 1 if gained <= tolerance else 0

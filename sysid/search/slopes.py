@@ -47,7 +47,7 @@ def choose_difference(plan: IslandPlan, search: SearchRecord) -> float:
     step. Where switching (dry friction) makes the fitness rough, such slopes look past the next
     ripple, and no ripple stops all of them.
     """
-    if search.wide_differences == 0:
+    if not search.wide_differences:
         return FINE_DIFFERENCE
     word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, 0)
     return float(10.0 ** (-2.0 - 4.0 * to_uniform(word[2])))
