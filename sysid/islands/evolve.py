@@ -24,10 +24,10 @@ from sysid.islands.packed import (
     pack_islands,
     unpack_islands,
 )
-from sysid.islands.stopping import StoppingRule, has_search_ended
+from sysid.islands.stopping import StoppingRule, has_search_ended, make_stopping_rule
 from sysid.kernels.borrowing import compile_borrowing
 from sysid.search.evolution import is_done, repeats_chromosomes, run_generations
-from sysid.search.island import NO_TARGET_RMS, Island
+from sysid.search.island import Island
 from sysid.search.known_fitness import get_island_memory, make_known_fitness
 from sysid.search.state import (
     COLUMN_RMS,
@@ -123,13 +123,6 @@ def make_search_plan(
     )
     plans = shared_plan.plans._replace(seed=seed, progress=compute_record_progress(problem))
     return shared_plan._replace(plans=plans)
-
-
-def make_stopping_rule(algorithm: GeneticAlgorithm, *, is_warm: bool) -> StoppingRule:
-    """Make the stopping rule of a run."""
-    stop = algorithm.stop
-    target = NO_TARGET_RMS if stop.rms is None else float(stop.rms)
-    return StoppingRule(algorithm.generations, target, stop.settled or 0, is_warm)
 
 
 def get_border_interval(algorithm: GeneticAlgorithm, *, is_warm: bool) -> int:
