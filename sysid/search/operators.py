@@ -22,14 +22,12 @@ RandomWords: TypeAlias = tuple[Any, Any, Any, Any]
 """Four independent words of 32 bits, as integers."""
 
 # Uses of random numbers, one word of the counter.
-USE_INITIAL, USE_STRATA, USE_CHILDREN, USE_LOCAL_SEARCH, USE_RESTART, USE_WARM_START = (
-    1,
-    2,
-    3,
-    4,
-    5,
-    6,
-)
+USE_INITIAL = 1
+USE_STRATA = 2
+USE_CHILDREN = 3
+USE_LOCAL_SEARCH = 4
+USE_RESTART = 5
+USE_WARM_START = 6
 
 _MASK = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
