@@ -193,7 +193,7 @@ def has_search_ended(
     restarts = count_restarts(rms, search)
     # Only islands that have used up their evaluations stay below the border.
     all_rest = bool(np.all(search.generation < generation))
-    return (
+    return bool(
         generation >= rule.most_generations
         or np.min(rms) <= rule.target_rms
         or _restarts_agree(rule.agreements, restarts, is_old)
