@@ -351,6 +351,8 @@ def _do_nothing() -> None:
 def jit_compile(function: _Function, compiler: type[CompilerBase] = Compiler) -> _Function:
     """Compile with Numba: cached on disk, GIL released, IEEE 754 division.
 
+    `compiler` is Numba's, or one with more passes such as that of `sysid.kernels.borrowing`.
+
     No `fastmath`: ``isfinite`` must work, and a run must give the same bits on every worker.
     """
     options = {"nogil": True, "error_model": "numpy", "pipeline_class": compiler}

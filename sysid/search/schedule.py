@@ -1,14 +1,14 @@
 """Schedule of the local searches: which kind comes next, as tables of named kinds.
 
-Local searches count from 1. The first ones have a table of their own. Later ones take its row from
-a cycle, by their number: `SMOOTH_CYCLE`, or `ROUGH_CYCLE` once the fitness is known to jump. Better
-optima are then near the champion, so most searches are hops. Those that grow from far away grow
-fast, so that they cost little.
+The local searches of an island count from 1. The first four have rows of their own. Later ones
+take their row from a cycle, by their number: from `SMOOTH_CYCLE`, or from `ROUGH_CYCLE` once the
+fitness is known to jump. Better optima are then near the champion, so most searches are hops. Those
+that grow from far away grow fast, so that they cost little (decisions 22, 28 and 47).
 
-A row has three columns. A new champion is first searched from on the whole record, because later
-searches begin around it (`unsettled`). Once that search has ended, `settled` holds. `coloured`
-holds instead if the fitness jumps and the champion's residuals are more than noise. An entry names
-three kinds, and each is drawn in a third of the cases.
+A row has three columns. `unsettled` holds until a search from the champion on the whole record has
+ended, because later searches begin around it. Then `settled` holds, or `coloured` if the fitness
+jumps and the champion's residuals are more than noise. An entry names three kinds, and each is
+drawn in a third of the cases.
 """
 
 from typing import NamedTuple, TypeAlias
@@ -117,7 +117,7 @@ FIRST_WARM_TURNS = (
     *FIRST_TURNS[:-1],
     _make_turn(GROW_FAST, (HOP_FROM_RANDOM_POINT, HOP_FROM_INDIVIDUAL, HOP)),
 )
-"""The same behind an earlier result, which a hop confirms or refutes sooner."""
+"""The same after a warm start: a hop confirms or refutes the earlier result sooner."""
 
 SMOOTH_CYCLE = (
     _make_turn(
