@@ -24,9 +24,7 @@ from sysid.models.ties import resolve_ties
 
 _PERIOD_SYMBOL = Symbol("h", "period")
 _STEP_ROUNDING = 1e-9  # of a step: a delay shorter than a whole step by this counts as one
-_MIN_STEPS_PER_TIME_CONSTANT = (
-    2.0  # least number of integration steps in each time constant of the controller
-)
+_MIN_STEPS_PER_TIME_CONSTANT = 2.0  # steps of integration, for each one of the controller
 _MAX_SUBSTEPS = 1000
 
 

@@ -27,10 +27,9 @@ _NEGLIGIBLE_GAIN = 1e-3  # loop gain below which the search ends: a gain margin 
 _SECANT_STEPS = 12  # enough for steps of a hundredth, also at sharp resonances
 _PHASE_ROUNDING = 1e-6  # rad
 _UNRESOLVED_TURN = 0.5  # rad: a larger turn from one frequency to the next may be missed
-_MAX_REFINEMENTS, _REFINEMENT_PARTS = 8, 10  # parts into which such a step is divided
-_MAX_UNRESOLVED_STEPS = (
-    1000  # more such steps are caused by a dead time at irrelevant frequencies, not by a root
-)
+_MAX_REFINEMENTS = 8  # of such steps, one after the other
+_REFINEMENT_PARTS = 10  # into which each of these steps is divided
+_MAX_UNRESOLVED_STEPS = 1000  # more such steps come from a dead time at irrelevant frequencies
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,6 +28,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import llvmlite
 import numba
 import numpy as np
+from numba.core.compiler import Compiler, CompilerBase
 
 from sysid.core.code_cache import digest_files, load_code, store_code, warn_not_cached
 
@@ -346,12 +347,15 @@ def _do_nothing() -> None:
     """Stand in for Numba's search for extensions of itself."""
 
 
-def jit_compile(function: _Function) -> _Function:
+def jit_compile(function: _Function, compiler: type[CompilerBase] = Compiler) -> _Function:
     """Compile with Numba: cached on disk, GIL released, IEEE 754 division.
+
+    `compiler` is Numba's, or one with more passes such as that of `sysid.kernels.borrowing`.
 
     No `fastmath`: ``isfinite`` must work, and a run must give the same bits on every worker.
     """
-    compiled: Any = numba.njit(nogil=True, error_model="numpy")(function)
+    options = {"nogil": True, "error_model": "numpy", "pipeline_class": compiler}
+    compiled: Any = numba.njit(**options)(function)
     if hasattr(compiled, "_cache"):
         compiled._cache = _FunctionCache(function)
         compiled.compile = _watch_compilation(compiled.compile)

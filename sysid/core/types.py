@@ -20,11 +20,11 @@ RANK_TOLERANCE = 1e-7  # of the largest singular value: below, the differences a
 
 
 def make_record_dtype(fields: type) -> np.dtype[Any]:
-    """Make the dtype of records with the annotated fields of a class, each int or float.
+    """Make the dtype of records with the annotated fields of a class, each bool, int or float.
 
     Compiled code reads and changes such a record by the names of its fields.
     """
-    types = {int: np.int64, float: np.float64}
+    types = {bool: np.bool_, int: np.int64, float: np.float64}
     return np.dtype(
         (np.record, [(name, types[kind]) for name, kind in get_type_hints(fields).items()])
     )

@@ -90,7 +90,7 @@ def describe_suspects(suspects: Sequence[Suspect]) -> str:
     """Describe the most likely suspect with its cure, and the next one."""
     first, *others = suspects
     other = next((f"; {one.name}: {one.gain:.0f}" for one in others if one.name != first.name), "")
-    return f"most likely of {first.name} (likelihood gain {first.gain:.0f}{other}). {first.cure}"
+    return f"{first.name} (likelihood gain {first.gain:.0f}{other}). {first.cure}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,17 +26,12 @@ from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.estimates import Estimate, NoiseColour, Uncertainty
 
-# Correlations that are reported: of an insignificant time lag, and of other parameters.
-_RIDGE_CORRELATION, _STRONG_CORRELATION = (
-    0.9,
-    0.95,
-)
+_RIDGE_CORRELATION = 0.9  # reported for an insignificant time lag: it shares its effect
+_STRONG_CORRELATION = 0.95  # reported for any two parameters
 _NOTABLE_GAIN = 0.01
 _SEPARABLE_STDERRS = 2.0  # standard errors: a smaller time lag is insignificant
 _VAGUE_SHARE = 0.5  # of its value: standard error from which a group is practically unidentifiable
-_WHITENESS_LEVEL = (
-    1e-3  # probability of such residuals under a true model, below which a warning is given
-)
+_WHITENESS_LEVEL = 1e-3  # probability of such residuals under a true model: below it, warn
 _SOLVER_SHARE = 1e-5  # of the output: smaller residuals are the solver's, which has kinks
 
 _STDERR_MEANINGS: Mapping[NoiseColour, str] = {
@@ -378,10 +373,10 @@ def _name_suspects(
     if not suspects or suspects[0].name == DYNAMICS or analysis.uncertainty is None:
         return []
     if are_white:
-        return [f"the residuals tell {describe_suspects(suspects)}"]
+        return [f"the residuals point to {describe_suspects(suspects)}"]
     meaning = _STDERR_MEANINGS[analysis.uncertainty.noise_colour]
     return [
-        f"the residuals are not white (on the {tests.data} data). They tell "
+        f"the residuals are not white (on the {tests.data} data). They point to "
         f"{describe_suspects(suspects)}. {meaning}"
     ]
 

@@ -17,11 +17,10 @@ from sysid.islands.evolve import (
     evolve_islands,
     get_border_interval,
     make_search_plan,
-    make_stopping_rule,
 )
 from sysid.islands.migration import migrate
 from sysid.islands.state import RunState
-from sysid.islands.stopping import has_search_ended
+from sysid.islands.stopping import has_search_ended, make_stopping_rule
 from sysid.search.island import Island, evolve, get_island_settings
 from sysid.selection.starts import find_equation_error_starts
 from sysid.simulation.problem import Problem

@@ -11,10 +11,10 @@ from sysid.core.types import FloatArray
 from sysid.search.archive import make_archive
 from sysid.search.evolution import draw_initial_places
 from sysid.search.island import (
-    NO_TARGET_RMS,
     Island,
     _compute_island_budget,
     get_island_settings,
+    get_target_rms,
     split_population,
 )
 from sysid.search.operators import USE_WARM_START, draw_words, encode, to_uniform
@@ -60,7 +60,7 @@ def make_shared_plans(algorithm: GeneticAlgorithm, n: int, scale: float) -> tupl
                 is_relative=int(settings.sequence.relative),
                 most_evaluations=_compute_island_budget(settings, n, size),
                 beta=float(settings.sequence.beta),
-                target_rms=NO_TARGET_RMS if settings.stop.rms is None else float(settings.stop.rms),
+                target_rms=get_target_rms(settings),
                 loss_scale=scale,
                 mutation_starts=np.array([start for start, _ in settings.mutation], dtype=np.int64),
                 mutation_rates=np.array([rate for _, rate in settings.mutation], dtype=np.float64),

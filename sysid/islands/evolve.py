@@ -24,10 +24,10 @@ from sysid.islands.packed import (
     pack_islands,
     unpack_islands,
 )
-from sysid.islands.stopping import StoppingRule, has_search_ended
-from sysid.kernels.borrowing import borrow
+from sysid.islands.stopping import StoppingRule, has_search_ended, make_stopping_rule
+from sysid.kernels.borrowing import compile_borrowing
 from sysid.search.evolution import is_done, repeats_chromosomes, run_generations
-from sysid.search.island import NO_TARGET_RMS, Island
+from sysid.search.island import Island
 from sysid.search.known_fitness import get_island_memory, make_known_fitness
 from sysid.search.state import (
     COLUMN_RMS,
@@ -123,13 +123,6 @@ def make_search_plan(
     )
     plans = shared_plan.plans._replace(seed=seed, progress=compute_record_progress(problem))
     return shared_plan._replace(plans=plans)
-
-
-def make_stopping_rule(algorithm: GeneticAlgorithm, *, is_warm: bool) -> StoppingRule:
-    """Make the stopping rule of a run."""
-    stop = algorithm.stop
-    target = NO_TARGET_RMS if stop.rms is None else float(stop.rms)
-    return StoppingRule(algorithm.generations, target, stop.settled or 0, is_warm)
 
 
 def get_border_interval(algorithm: GeneticAlgorithm, *, is_warm: bool) -> int:
@@ -247,7 +240,7 @@ def compute_next_border(
     )
 
 
-@jit_compile
+@compile_borrowing
 def _run_epochs(
     evaluator: Evaluator,
     plan: SearchPlan,
@@ -258,7 +251,6 @@ def _run_epochs(
     log: EvolutionLog,
 ) -> tuple[int, int, bool]:
     """Evolve in place; return the last border, the migrations and whether it was just passed."""
-    evaluator, plan, packed, log = borrow((evaluator, plan, packed, log))
     known = _make_memories(plan.plans, packed.champions.shape[1])
     for _ in range(plan.most_borders):
         target = compute_next_border(
@@ -291,7 +283,7 @@ def _make_memories(plans: PackedPlans, n: int) -> KnownFitness:
     return make_known_fitness(0, n)
 
 
-@jit_compile
+@compile_borrowing
 def _evolve_to_border(
     evaluator: Evaluator,
     plans: PackedPlans,
@@ -302,8 +294,6 @@ def _evolve_to_border(
     log: EvolutionLog,
 ) -> int:
     """Evolve every island up to a border; return the remaining budget, −1 if it ran out."""
-    evaluator, plans, packed, log = borrow((evaluator, plans, packed, log))
-    known = borrow(known)
     for i in range(packed.champion_rms.size):
         begin, end = packed.offsets[i], packed.offsets[i + 1]
         plan, search, written = unpack_plan(plans, i), packed.search[i], log.counts[0]
@@ -341,12 +331,11 @@ def is_island_resting(plan: IslandPlan, island: IslandArrays, rms: float) -> boo
     return is_done(plan, island.search, rms)
 
 
-@jit_compile
+@compile_borrowing
 def _record_improvements(
     packed: PackedIslands, island: int, improvements: int, log: EvolutionLog
 ) -> None:
     """Record the island of the improvements just written, and make the last one its champion."""
-    packed, log = borrow((packed, log))
     for r in range(log.counts[0], log.counts[0] + improvements):
         log.improvement_islands[r] = island
     log.counts[0] += improvements

@@ -17,7 +17,7 @@ from sysid.islands.packed import (
     unpack_islands,
 )
 from sysid.islands.topology import list_edges
-from sysid.kernels.borrowing import borrow
+from sysid.kernels.borrowing import compile_borrowing
 from sysid.search.evolution import reset_evidence, write_improvement
 from sysid.search.island import Island
 from sysid.search.operators import decode, encode, sort_population
@@ -72,12 +72,11 @@ def migrate(
     return unpack_islands(packed, log, islands), list_migrants(log)
 
 
-@jit_compile
+@compile_borrowing
 def exchange_migrants(
     routes: MigrationRoutes, packed: PackedIslands, epoch: int, log: EvolutionLog
 ) -> None:
     """Exchange migrants once in place (see `migrate`). An edge writes one improvement at most."""
-    routes, packed, log = borrow((routes, packed, log))
     words, fitness = packed.chromosomes.copy(), packed.fitness.copy()
     champions = packed.champions.copy()
     discontinuities = packed.search.fitness_discontinuities.copy()
@@ -103,10 +102,9 @@ def exchange_migrants(
                 _record_champion(packed, destination, fitness[p], champions[source], log)
 
 
-@jit_compile
+@compile_borrowing
 def _accepts_migrant(packed: PackedIslands, island: int, word: WordArray, fitness: float) -> bool:
     """Return whether a migrant is fitter than the worst individual, and new on the island."""
-    packed, word = borrow((packed, word))
     begin, end = packed.offsets[island], packed.offsets[island + 1]
     if not fitness < packed.fitness[end - 1]:  # nan (not evaluated yet) comes last and stays
         return False
@@ -119,10 +117,9 @@ def _accepts_migrant(packed: PackedIslands, island: int, word: WordArray, fitnes
     return True
 
 
-@jit_compile
+@compile_borrowing
 def _insert_migrant(packed: PackedIslands, island: int, word: WordArray, fitness: float) -> None:
     """Replace the worst individual by a migrant."""
-    packed, word = borrow((packed, word))
     begin, end = packed.offsets[island], packed.offsets[island + 1]
     for d in range(word.size):
         packed.chromosomes[end - 1, d] = word[d]
@@ -139,7 +136,7 @@ def _record_champion(
     log.improvement_islands[log.counts[0]] = island
     log.counts[0] += 1
     write_improvement(search, fitness, PHASE_MIGRATION, values, row)
-    search.stagnation, search.champion_converged = 0, 0
+    search.stagnation, search.champion_converged = 0, False
     reset_evidence(search, fitness, packed.champion_rms[island])
     packed.champion_rms[island] = fitness
     for d in range(values.size):

@@ -41,15 +41,12 @@ _PLACES_PER_ROUND = 192  # points in a round
 _STARTS_PER_ROUND = 8  # of these: the lowest compared to the linear model
 _MAX_ROUNDS = 2
 _MAX_STEPS = 12  # of least squares from each point
-_ROUGHNESS_TOLERANCE = (
-    0.5  # of the linear model's likelihood ratio: smaller deviations are no roughness
-)
+_ROUGHNESS_TOLERANCE = 0.5  # of the linear model's likelihood ratio: a larger deviation is rough
 _BATCH_SIZE = 32  # points around the best one
-_FIRST_SPREAD, _LAST_SPREAD = (
-    0.5,
-    1e-3,
-)  # their spread at the beginning and at the end, standard errors
-_SPREAD_GROWTH, _SPREAD_DECAY = 1.1, 0.7  # spread after a gain, after none
+_FIRST_SPREAD = 0.5  # standard errors: their spread at the beginning
+_LAST_SPREAD = 1e-3  # standard errors: a smaller spread ends the search
+_SPREAD_GROWTH = 1.1  # of the spread, after a gain
+_SPREAD_DECAY = 0.7  # of the spread, after none
 _MAX_SIMULATIONS = 1800  # simulations
 _MAX_WORK = 50_000_000  # steps of integration or recursion: on long records simulations are fewer
 _MAX_LATE_WORK = 5_000_000  # as many when the time of the run is over

@@ -14,12 +14,9 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, WordArray
-from sysid.kernels.borrowing import borrow
+from sysid.kernels.borrowing import compile_borrowing
 from sysid.search.archive import archive_end
 from sysid.search.basin_hopping import (
-    COUNTED_HOP,
-    SINGLE_PARAMETER_HOP,
-    UNCOUNTED_HOP,
     hop_from_champion,
     is_behind_champion,
     is_champion_coloured,
@@ -28,14 +25,22 @@ from sysid.search.basin_hopping import (
 from sysid.search.levenberg_marquardt import factor_damped, write_damped_step, write_spread_place
 from sysid.search.operators import (
     USE_LOCAL_SEARCH,
-    RandomWords,
     decode,
     draw_words,
     encode,
     sort_population,
-    to_integer,
     to_normal,
     to_uniform,
+)
+from sysid.search.schedule import (
+    AT_CHAMPION,
+    AT_INDIVIDUAL,
+    AT_RANDOM_POINT,
+    EARLY_SEARCHES,
+    NO_HOP,
+    asks_residuals,
+    begin_growth,
+    choose_local_search,
 )
 from sysid.search.slopes import build_normal_equations, choose_difference, evaluate_partial_fitness
 from sysid.search.state import SAME_OPTIMUM, IslandArrays, IslandPlan, SearchRecord
@@ -46,25 +51,18 @@ N_TRIALS = 3
 DAMPING_FACTOR = 10.0  # between the dampings of two trials
 FIRST_DAMPING = 1e-2
 EARLY_DAMPING = 1.0  # far from a minimum, where a full step would leave the bounds
-EARLY_PLACES = 4  # random points: an early random search starts from the best of them
-MAX_GROWTH_DOUBLINGS = 4.0  # doublings
-N_GROWTHS = 3
+EARLY_POINTS = 4  # random points: an early random search starts from the best of them
 MAX_SEARCH_STEPS = 12
 ENOUGH_GAIN = 1e-4  # relative gain of a step below which a full-record search ends
 ENOUGH_PART_GAIN = 1e-2
-EARLY_SEARCHES = 4  # cheap local searches in immediate succession, before the long ones
 FAR_FITNESS = 1.1  # times the champion's fitness: above, a search ends at the first small gain
-SEARCH_CYCLE = 8  # local searches until their kinds repeat, where the fitness jumps
-SCATTER_TURN, GROWTH_TURN = 2, 4  # turns: of four to scatter, of eight to grow near the champion
-SHORT_GROWTH = 1.5  # doublings: near the champion the later signs of velocities are right
 
 
-@jit_compile
+@compile_borrowing
 def _draw_best_start(
     evaluator: Evaluator, plan: IslandPlan, shape: tuple[int, int], search: SearchRecord
 ) -> FloatArray:
     """Draw random points and return the one that fits the record best up to the horizon."""
-    evaluator, plan = borrow((evaluator, plan))
     places, horizon = np.empty(shape), search.horizon
     for p in range(shape[0]):
         for d in range(shape[1]):
@@ -78,128 +76,56 @@ def _draw_best_start(
 
 
 @jit_compile
-def has_scattered(search: SearchRecord) -> bool:
-    """Return whether the last local search scattered the population around the champion."""
-    return bool(search.local_searches % (SEARCH_CYCLE // 2) == SCATTER_TURN)
+def _is_coloured(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> bool:
+    """Return whether this turn asks for the champion's residuals, and they are more than noise.
 
-
-@jit_compile
-def _should_search_far(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> bool:
-    """Return whether to replace a hop by a search far away; False near the end of a budget."""
+    False near the end of a budget.
+    """
     search = island.search
-    turn = search.local_searches % SEARCH_CYCLE
-    if turn % 2 == 0 or turn == 1:
-        return False
-    if search.champion_converged == 0 or search.fitness_discontinuities == 0:
+    if not asks_residuals(search):
         return False
     if search.evaluations + max(island.chromosomes.shape) + 2 > plan.most_evaluations:
         return False
     return is_champion_coloured(evaluator, plan, island)
 
 
-@jit_compile
-def _choose_discontinuous_start(
-    size: int, word: RandomWords, is_lost: bool, search: SearchRecord
-) -> int:
-    """Choose the next search where the fitness jumps: better optima are then near the champion.
-
-    Of eight local searches four are hops (two of them move one parameter) and two scatter. One
-    grows the horizon from near the champion, with one parameter moved. One grows it from far away,
-    in two of three cases from random individuals. Both grow so fast that they cost little.
-
-    If the champion's residuals are not noise, random individuals replace three of the hops.
-    """
-    turn = search.local_searches % SEARCH_CYCLE
-    search.wide_differences = 1
-    if (
-        search.champion_converged == 0
-    ):  # first the champion on the whole record: later points are drawn around it
-        return 0
-    if is_lost:
-        search.horizon = 0.5 ** (MAX_GROWTH_DOUBLINGS * (1.0 + to_uniform(word[0])) / 2.0)
-        search.horizon_growth = 2.0
-        return -1
-    if turn % 2 == 1:
-        search.hop_kind = COUNTED_HOP + SINGLE_PARAMETER_HOP if turn % 4 == 3 else COUNTED_HOP
-        return 0
-    if has_scattered(search):
-        search.probe_count = size
-        return 0
-    search.horizon_growth = 2.0
-    if turn == GROWTH_TURN:
-        search.hop_kind = UNCOUNTED_HOP + SINGLE_PARAMETER_HOP
-        search.horizon = 0.5 ** (SHORT_GROWTH * to_uniform(word[0]))
-        return 0
-    search.horizon = 0.5 ** (MAX_GROWTH_DOUBLINGS * to_uniform(word[0]))
-    if to_integer(word[1], 3) > 0:
-        return -1
-    search.horizon_growth = 2.0 ** (0.5 ** (1 + to_integer(word[3], N_GROWTHS)))
-    search.probe_count = size // 3
-    return to_integer(word[2], size)
-
-
-@jit_compile
-def _choose_start(plan: IslandPlan, size: int, is_lost: bool, search: SearchRecord) -> int:
-    """Choose the next kind of search; return the individual to start from, -1: a random one."""
-    number = search.local_searches
-    word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, 0)
-    if search.fitness_discontinuities > 0 and number > EARLY_SEARCHES:
-        return _choose_discontinuous_start(size, word, is_lost, search)
-    grows = number == EARLY_SEARCHES or (number > EARLY_SEARCHES and number % 2 == 0)
-    last_early_search = (
-        EARLY_SEARCHES - search.is_warm_start
-    )  # in a warm start the last of them is a hop
-    is_settled = search.champion_converged == 1 and number > last_early_search
-    chosen = to_integer(word[1], 3 * size) - size if grows else 0
-    search.wide_differences = search.champion_converged == 1 or grows
-    if is_settled and (chosen >= size or number % 4 == 1 or number == EARLY_SEARCHES):
-        search.hop_kind = COUNTED_HOP
-    elif grows:
-        search.horizon = 0.5 ** (MAX_GROWTH_DOUBLINGS * to_uniform(word[0]))
-        doublings = 1.0 if number == EARLY_SEARCHES else 0.5 ** (1 + to_integer(word[3], N_GROWTHS))
-        search.horizon_growth = 2.0**doublings
-        # Probes fill vector elements that would be idle.
-        search.probe_count = 0 if number == EARLY_SEARCHES else size // 3
-    elif is_settled:
-        search.probe_count = size
-    if 1 < number <= EARLY_SEARCHES and not search.hop_kind:
-        chosen = -1
-    return chosen if chosen < size else 0
-
-
-@jit_compile
+@compile_borrowing
 def start_local_search(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
     """Choose the start of a local search, and the part of the record that it fits first."""
-    evaluator, plan, island = borrow((evaluator, plan, island))
     chromosomes, search = island.chromosomes, island.search
     search.local_searches += 1
-    search.in_sequence_search, search.step_count, search.failed_steps = 1, 0, 0
-    search.probe_count, search.from_random_start, search.hop_kind = 0, 0, 0
-    early = search.local_searches <= EARLY_SEARCHES
-    search.damping = EARLY_DAMPING if early else FIRST_DAMPING
-    search.horizon, search.reached_fitness = 1.0, np.inf
-    is_lost = _should_search_far(evaluator, plan, island)
-    chosen = _choose_start(plan, chromosomes.shape[0], is_lost, search)
+    search.in_sequence_search, search.step_count, search.failed_steps = True, 0, 0
+    is_early = search.local_searches <= EARLY_SEARCHES
+    search.damping = EARLY_DAMPING if is_early else FIRST_DAMPING
+    search.reached_fitness, size = np.inf, chromosomes.shape[0]
+    word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, 0)
+    is_coloured = _is_coloured(evaluator, plan, island)
+    kind, individual = choose_local_search(size, word, is_coloured, search)
+    begin_growth(kind, word, search)
+    search.probe_count = size * kind.probes // 3
+    begins, search.hop, search.hop_is_evidence = kind.begins, kind.hop, kind.is_evidence
     # The points of a random start, or the slopes of a hop, would exceed the budget.
     if search.evaluations + max(chromosomes.shape) + 1 > plan.most_evaluations:
-        chosen, search.hop_kind = max(chosen, 0), 0
-    if chosen >= 0:
-        search.replaced_fitness = np.inf if search.hop_kind else island.fitness[chosen]
-        begin = decode(chromosomes[chosen : chosen + 1], plan.bits)[0]
-    else:
-        search.replaced_fitness, search.from_random_start = np.inf, 1
-        drawn = min(EARLY_PLACES, chromosomes.shape[0]) if early else chromosomes.shape[0]
+        begins = AT_CHAMPION if begins == AT_RANDOM_POINT else begins
+        search.hop, search.hop_is_evidence = NO_HOP, False
+    search.from_random_start, search.replaced_fitness = begins == AT_RANDOM_POINT, np.inf
+    if search.from_random_start:
+        drawn = min(EARLY_POINTS, size) if is_early else size
         begin = _draw_best_start(evaluator, plan, (drawn, chromosomes.shape[1]), search)
+    else:
+        chosen = individual if begins == AT_INDIVIDUAL else 0
+        begin = decode(chromosomes[chosen : chosen + 1], plan.bits)[0]
+        if search.hop == NO_HOP:
+            search.replaced_fitness = island.fitness[chosen]
     for d in range(begin.size):
         island.point[d] = begin[d]
-    if search.hop_kind:
+    if search.hop != NO_HOP:
         hop_from_champion(evaluator, plan, island)
 
 
-@jit_compile
+@compile_borrowing
 def _replace_individual(island: IslandArrays, chromosome: WordArray, reached: float) -> None:
     """Replace the individual that the search started from, or else the worst one."""
-    island, chromosome = borrow((island, chromosome))
     chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
     index = fitness.size - 1
     for p in range(fitness.size - 1, -1, -1):
@@ -213,12 +139,11 @@ def _replace_individual(island: IslandArrays, chromosome: WordArray, reached: fl
         search.replaced_fitness = reached
 
 
-@jit_compile
+@compile_borrowing
 def _scatter_population(
     island: IslandArrays, proposals: WordArray, reached: FloatArray, best: int
 ) -> None:
     """Replace all individuals but the champion by the probes; the genetic search continues."""
-    island, proposals, reached = borrow((island, proposals, reached))
     chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
     if search.probe_count < fitness.size:  # probes of a growing horizon stay for the next step
         return
@@ -249,10 +174,10 @@ def _extend_horizon(search: SearchRecord, champion: float) -> None:
     if search.horizon < 1.0:
         search.horizon = min(search.horizon * search.horizon_growth, 1.0)
         return
-    search.in_sequence_search, search.step_count = 0, 0
+    search.in_sequence_search, search.step_count = False, 0
     if search.replaced_fitness == champion and search.local_searches > 1:
-        search.champion_converged = 1
-    if search.hop_kind & COUNTED_HOP:
+        search.champion_converged = True
+    if search.hop_is_evidence:
         search.hop_count += 1
         search.returned_hops += has_returned(search, champion)
     if search.from_random_start:
@@ -260,31 +185,29 @@ def _extend_horizon(search: SearchRecord, champion: float) -> None:
         search.confirmed_starts += search.reached_fitness <= champion * (1.0 + SAME_OPTIMUM)
 
 
-@jit_compile
+@compile_borrowing
 def _finish_part(
     evaluator: Evaluator, plan: IslandPlan, island: IslandArrays, reached: float
 ) -> None:
     """Extend the horizon; end early if a far search near jumps is behind the champion."""
-    evaluator, plan, island = borrow((evaluator, plan, island))
     search = island.search
-    races = search.horizon < 1.0 and search.fitness_discontinuities > 0 and search.hop_kind == 0
+    races = search.horizon < 1.0 and search.fitness_discontinuities > 0 and search.hop == NO_HOP
     if races and is_behind_champion(evaluator, plan, island, search.horizon, reached):
         search.horizon = 1.0
     _extend_horizon(search, island.fitness[0])
-    has_ended = search.in_sequence_search == 0 and np.isfinite(search.reached_fitness)
+    has_ended = not search.in_sequence_search and np.isfinite(search.reached_fitness)
     if has_ended and search.from_random_start:
         archive_end(island.archive, island.point, search.reached_fitness)
-    is_smooth_hop = search.hop_kind & COUNTED_HOP and search.fitness_discontinuities == 0
+    is_smooth_hop = search.hop_is_evidence and search.fitness_discontinuities == 0
     if has_ended and is_smooth_hop and has_returned(search, island.fitness[0]):
         search.champion_explained = is_champion_explained(evaluator, plan, island)
 
 
-@jit_compile
+@compile_borrowing
 def _propose_places(
     plan: IslandPlan, island: IslandArrays, matrix: FloatArray, gradient: FloatArray, base: float
 ) -> FloatArray:
     """Propose steps of several dampings, and probes drawn from the estimate's covariance."""
-    plan, island, matrix, gradient = borrow((plan, island, matrix, gradient))
     point, search = island.point, island.search
     places = np.empty((N_TRIALS + search.probe_count, point.size))
     for t in range(N_TRIALS):
@@ -300,10 +223,9 @@ def _propose_places(
     return places
 
 
-@jit_compile
+@compile_borrowing
 def run_adaptive_sequence(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
     """Run one generation of the adaptive search: sensitivities, then several steps at once."""
-    evaluator, plan, island = borrow((evaluator, plan, island))
     point, search = island.point, island.search
     horizon = search.horizon
     search.step_count += 1

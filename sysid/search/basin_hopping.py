@@ -20,7 +20,7 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
-from sysid.kernels.borrowing import borrow
+from sysid.kernels.borrowing import compile_borrowing
 from sysid.search.levenberg_marquardt import factor_damped, write_spread_place
 from sysid.search.operators import (
     USE_LOCAL_SEARCH,
@@ -30,6 +30,7 @@ from sysid.search.operators import (
     to_normal,
     to_uniform,
 )
+from sysid.search.schedule import HOP_IN_ONE_PARAMETER
 from sysid.search.slopes import build_normal_equations, choose_difference, evaluate_partial_fitness
 from sysid.search.state import IslandArrays, IslandPlan, SearchRecord
 from sysid.simulation.evaluator import Evaluator, evaluate_population, predict_partially
@@ -58,7 +59,7 @@ def find_odd_increment(losses: FloatArray) -> tuple[int, float]:
     return index, largest
 
 
-@jit_compile
+@compile_borrowing
 def _evaluate_line(
     evaluator: Evaluator,
     factor: FloatArray,
@@ -69,7 +70,6 @@ def _evaluate_line(
     largest_loss: float,
 ) -> FloatArray:
     """Evaluate the squared fitness, limited to `largest_loss`, at equal distances on a line."""
-    evaluator, factor, point, direction = borrow((evaluator, factor, point, direction))
     places, deviation = np.empty((LINE_PLACES, point.size)), np.empty(point.size)
     for p in range(LINE_PLACES):
         for d in range(point.size):
@@ -80,7 +80,7 @@ def _evaluate_line(
     )
 
 
-@jit_compile
+@compile_borrowing
 def has_discontinuity(
     evaluator: Evaluator,
     factor: FloatArray,
@@ -102,7 +102,6 @@ def has_discontinuity(
     search : SearchRecord
         Search record of the island, which counts the simulations.
     """
-    evaluator, factor, point, direction = borrow((evaluator, factor, point, direction))
     first, width, before, upper_loss = -LINE_REACH, 2.0 * LINE_REACH, 0.0, 0.0
     variance, largest_loss = base**2 / evaluator.n_scored, _HIGH_LOSS * base**2
     for level in range(_ZOOM_LEVELS):
@@ -120,17 +119,14 @@ def has_discontinuity(
 
 
 MIN_HOP, MAX_HOP = 0.3, 50.0  # standard errors
-# Bits of a kind of hop: counted as evidence for the champion, not counted, of one parameter.
-COUNTED_HOP, UNCOUNTED_HOP, SINGLE_PARAMETER_HOP = 1, 2, 4
 SINGLE_HOP_FACTOR = 10.0  # one parameter moves so much farther, in its conditional standard errors
 PROBED_HOPS = 4  # hops that also test for jumps of the fitness, until there is one
 LINES_PER_HOP = 2  # lines that each of them tests
 
 
-@jit_compile
+@compile_borrowing
 def hop_from_champion(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
     """Move the point away from the champion, along the covariance or in one parameter."""
-    evaluator, plan, island = borrow((evaluator, plan, island))
     point, search = island.point, island.search
     search.evaluations += point.size + 1
     difference = choose_difference(plan, search)
@@ -138,9 +134,9 @@ def hop_from_champion(evaluator: Evaluator, plan: IslandPlan, island: IslandArra
     word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, 0)
     size = base * MIN_HOP * (MAX_HOP / MIN_HOP) ** to_uniform(word[0])
     factor = factor_damped(matrix, gradient, point, 0.0)
-    if search.hop_kind & COUNTED_HOP:
+    if search.hop_is_evidence:
         _probe_discontinuities(evaluator, plan, factor, base, island)
-    if search.hop_kind & SINGLE_PARAMETER_HOP:
+    if search.hop == HOP_IN_ONE_PARAMETER:
         _move_single_parameter(plan, search, matrix, SINGLE_HOP_FACTOR * size, point)
     else:
         write_spread_place(factor, point, _draw_deviation(plan, search, 0, size, point.size), point)
@@ -174,12 +170,11 @@ def _draw_deviation(
     return drawn
 
 
-@jit_compile
+@compile_borrowing
 def _probe_discontinuities(
     evaluator: Evaluator, plan: IslandPlan, factor: FloatArray, base: float, island: IslandArrays
 ) -> None:
     """Record whether the fitness jumps on lines through the point; not at the end of a budget."""
-    evaluator, plan, factor, island = borrow((evaluator, plan, factor, island))
     point, search = island.point, island.search
     for line in range(1, LINES_PER_HOP + 1):
         if (
@@ -192,7 +187,7 @@ def _probe_discontinuities(
             jumps = has_discontinuity(evaluator, factor, point, direction, base, search)
             search.champion_discontinuities += jumps
             # A warm start needs fewer agreeing restarts, a number chosen for smooth fitness.
-            search.fitness_discontinuities += jumps and search.is_warm_start == 0
+            search.fitness_discontinuities += jumps and not search.is_warm_start
 
 
 COLOUR_THRESHOLD = 0.5  # correlation of neighbouring residuals: noise has 0, a wrong response 1

@@ -4,14 +4,8 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, IntArray, WordArray
-from sysid.kernels.borrowing import borrow
-from sysid.search.adaptive_search import (
-    EARLY_SEARCHES,
-    N_TRIALS,
-    has_scattered,
-    run_adaptive_sequence,
-    start_local_search,
-)
+from sysid.kernels.borrowing import compile_borrowing
+from sysid.search.adaptive_search import N_TRIALS, run_adaptive_sequence, start_local_search
 from sysid.search.known_fitness import recall_fitness, remember_fitness
 from sysid.search.operators import (
     USE_CHILDREN,
@@ -30,6 +24,7 @@ from sysid.search.operators import (
     to_integer,
     to_uniform,
 )
+from sysid.search.schedule import EARLY_SEARCHES, has_scattered
 from sysid.search.sequence_search import run_fixed_sequence
 from sysid.search.state import (
     COLUMN_EVALUATIONS,
@@ -86,10 +81,9 @@ def draw_initial_places(
     return places
 
 
-@jit_compile
+@compile_borrowing
 def breed_simple_children(plan: IslandPlan, island: IslandArrays) -> None:
     """Breed as in Figure 4: the survivors stay, their children replace the others."""
-    plan, island = borrow((plan, island))
     chromosomes, fitness = island.chromosomes, island.fitness
     generation, length = island.search.generation, chromosomes.shape[1] * plan.bits
     rate = get_mutation_rate(plan.mutation_starts, plan.mutation_rates, generation)
@@ -109,7 +103,7 @@ def breed_simple_children(plan: IslandPlan, island: IslandArrays) -> None:
         fitness[p] = np.nan
 
 
-@jit_compile
+@compile_borrowing
 def _breed_child(
     plan: IslandPlan,
     places: FloatArray,
@@ -119,7 +113,6 @@ def _breed_child(
     word: WordArray,
 ) -> None:
     """Write child `p` by crossover or by differential evolution."""
-    plan, places, parents, word = borrow((plan, places, parents, word))
     bits, n = plan.bits, word.size
     first_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p)
     next_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p + 1)
@@ -143,10 +136,9 @@ def _breed_child(
         word[d] = np.uint32(round(place * float((1 << bits) - 1)))
 
 
-@jit_compile
+@compile_borrowing
 def breed_improved_children(plan: IslandPlan, island: IslandArrays) -> WordArray:
     """Breed as many children as there are individuals; they compete with their parents."""
-    plan, island = borrow((plan, island))
     parents = island.chromosomes
     children, places = np.empty_like(parents), decode(parents, plan.bits)
     for p in range(parents.shape[0]):
@@ -154,10 +146,9 @@ def breed_improved_children(plan: IslandPlan, island: IslandArrays) -> WordArray
     return children
 
 
-@jit_compile
+@compile_borrowing
 def redraw_population(plan: IslandPlan, island: IslandArrays) -> None:
     """Draw all individuals but the champion again."""
-    plan, island = borrow((plan, island))
     chromosomes, fitness = island.chromosomes, island.fitness
     largest, n = float((1 << plan.bits) - 1), chromosomes.shape[1]
     for p in range(1, fitness.size):
@@ -169,10 +160,9 @@ def redraw_population(plan: IslandPlan, island: IslandArrays) -> None:
             chromosomes[p, d] = np.uint32(round(to_uniform(word[0]) * largest))
 
 
-@jit_compile
+@compile_borrowing
 def select_fittest(island: IslandArrays, children: WordArray, reached: FloatArray) -> None:
     """Select the fittest of parents and children; on equal fitness the parent stays."""
-    island, children, reached = borrow((island, children, reached))
     chromosomes, fitness = island.chromosomes, island.fitness
     size, n = chromosomes.shape
     candidates, values = np.empty((2 * size, n), np.uint32), np.empty(2 * size)
@@ -193,7 +183,7 @@ def repeats_chromosomes(method: int) -> bool:
     return bool(method < METHOD_IMPROVED)
 
 
-@jit_compile
+@compile_borrowing
 def evaluate_new_individuals(
     evaluator: Evaluator,
     plan: IslandPlan,
@@ -205,8 +195,6 @@ def evaluate_new_individuals(
 
     Those that are known are not simulated again. They count in the returned number of evaluations.
     """
-    evaluator, plan, known = borrow((evaluator, plan, known))
-    chromosomes, fitness = borrow((chromosomes, fitness))
     evaluated = 0
     for p in range(fitness.size):
         evaluated += np.isnan(fitness[p])
@@ -227,9 +215,8 @@ def evaluate_new_individuals(
     return evaluated
 
 
-@jit_compile
+@compile_borrowing
 def _run_generation(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
-    evaluator, plan, island = borrow((evaluator, plan, island))
     chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
     if search.in_sequence_search and plan.method == METHOD_IMPROVED:
         run_adaptive_sequence(evaluator, plan, island)
@@ -259,10 +246,9 @@ def _run_generation(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays
     )
 
 
-@jit_compile
+@compile_borrowing
 def _switch_phase(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
     """Switch to the local search when the genetic search stagnates."""
-    evaluator, plan, island = borrow((evaluator, plan, island))
     search = island.search
     if search.in_sequence_search or plan.method == METHOD_SIMPLE:
         return
@@ -272,7 +258,7 @@ def _switch_phase(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) 
         if is_early or hops_next or search.step_count >= max(1, plan.stagnation // 10):
             start_local_search(evaluator, plan, island)
     elif search.stagnation >= plan.stagnation:
-        search.in_sequence_search, search.stagnation = 1, 0
+        search.in_sequence_search, search.stagnation = True, 0
 
 
 @jit_compile
@@ -299,7 +285,7 @@ def reset_evidence(search: SearchRecord, rms: float, before: float) -> None:
     """Reset the evidence for the champion if the new one is another optimum."""
     if rms < before * (1.0 - SAME_OPTIMUM):
         search.confirmed_starts, search.champion_discontinuities = 0, 0
-        search.hop_count, search.returned_hops, search.champion_explained = 0, 0, 0
+        search.hop_count, search.returned_hops, search.champion_explained = 0, 0, False
 
 
 @jit_compile
@@ -308,7 +294,7 @@ def is_done(plan: IslandPlan, search: SearchRecord, rms: float) -> bool:
     return bool(search.evaluations >= plan.most_evaluations or rms <= plan.target_rms)
 
 
-@jit_compile
+@compile_borrowing
 def run_generations(
     evaluator: Evaluator,
     plan: IslandPlan,
@@ -321,7 +307,6 @@ def run_generations(
     An island that has used up its evaluations or reached the target rests. The initial population
     is evaluated before the first generation.
     """
-    evaluator, plan, island, improvements = borrow((evaluator, plan, island, improvements))
     fitness, search, written = island.fitness, island.search, 0
     if np.any(np.isnan(fitness)):  # first generation, or migrants from an island of other bits
         # The count of evaluations does not tell: the starts of a polynomial may have taken some.
@@ -346,7 +331,7 @@ def run_generations(
             search.stagnation = 0
             reset_evidence(search, fitness[0], best)
             if phase == PHASE_GENETIC:
-                search.champion_converged = 0
+                search.champion_converged = False
             _record_improvement(evaluator, plan, island, phase, improvements[written])
             written += 1
     return written

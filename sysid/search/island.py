@@ -119,7 +119,7 @@ def stack_search(islands: Sequence[Island]) -> SearchArray:
 
 
 _UNLIMITED = 2**62
-NO_TARGET_RMS = -1.0
+_NO_TARGET_RMS = -1.0
 
 
 def split_population(algorithm: GeneticAlgorithm) -> tuple[int, ...]:
@@ -139,6 +139,12 @@ def get_island_settings(algorithm: GeneticAlgorithm, index: int) -> GeneticAlgor
         bits=change.bits or algorithm.bits,
         mutation=change.mutation or algorithm.mutation,
     )
+
+
+def get_target_rms(algorithm: GeneticAlgorithm) -> float:
+    """Get the fitness at which an island rests; negative: none."""
+    target = algorithm.stop.rms
+    return _NO_TARGET_RMS if target is None else float(target)
 
 
 def compute_search_budget(algorithm: GeneticAlgorithm, n: int) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, WordArray
-from sysid.kernels.borrowing import borrow
+from sysid.kernels.borrowing import compile_borrowing
 from sysid.search.state import KnownFitness
 
 _INDEX_BITS = 10
@@ -39,10 +39,9 @@ def _locate(chromosome: WordArray) -> int:
     return int(mixed >> _SHIFT)
 
 
-@jit_compile
+@compile_borrowing
 def recall_fitness(known: KnownFitness, chromosomes: WordArray, fitness: FloatArray) -> None:
     """Replace ``nan`` by the fitness of each chromosome (P, D) that is known."""
-    known, chromosomes, fitness = borrow((known, chromosomes, fitness))
     for p in range(fitness.size if known.fitness.size else 0):
         if np.isnan(fitness[p]):
             place, is_same = _locate(chromosomes[p]), True
@@ -52,10 +51,9 @@ def recall_fitness(known: KnownFitness, chromosomes: WordArray, fitness: FloatAr
                 fitness[p] = known.fitness[place]
 
 
-@jit_compile
+@compile_borrowing
 def remember_fitness(known: KnownFitness, chromosomes: WordArray, fitness: FloatArray) -> None:
     """Store the fitness (P,) of chromosomes (P, D)."""
-    known, chromosomes, fitness = borrow((known, chromosomes, fitness))
     for p in range(fitness.size if known.fitness.size else 0):
         place = _locate(chromosomes[p])
         known.fitness[place] = fitness[p]

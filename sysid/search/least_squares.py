@@ -19,7 +19,7 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, IntArray, make_record_dtype
-from sysid.kernels.borrowing import borrow
+from sysid.kernels.borrowing import compile_borrowing
 from sysid.search.levenberg_marquardt import (
     FINE_DIFFERENCE,
     compute_inner_product,
@@ -41,14 +41,14 @@ _STEPS_PER_CALL = 10_000_000  # steps of integration or recursion in one compile
 
 
 class _Progress(Protocol):
-    """Progress of a search. Fields that read as statements are 0 or 1."""
+    """Progress of a search."""
 
     loss: float  # at the present point
     damping: float
     idle_steps: int  # consecutive steps that gained almost nothing
-    has_jacobian: int  # the slopes are those of the present point
+    has_jacobian: bool  # the slopes are those of the present point
     evaluations: int
-    has_ended: int
+    has_ended: bool
 
 
 _PROGRESS = make_record_dtype(_Progress)
@@ -168,12 +168,11 @@ def steps_at_once(n_parameters: int, n_steps: int) -> int:
     return max(1, _STEPS_PER_CALL // ((n_parameters + N_TRIED) * n_steps))
 
 
-@jit_compile
+@compile_borrowing
 def _run_steps(
     scored: ScoredSamples, descent: _Descent, scale: float, steps: int, tolerance: float
 ) -> None:
     """Take some steps in place."""
-    scored, descent = borrow((scored, descent))
     place, progress = descent.place, descent.progress
     if progress.evaluations == 0:
         descent.error[:] = compute_residuals(scored, place.reshape((1, place.size)))[0]
@@ -184,19 +183,18 @@ def _run_steps(
             _take_step(scored, descent, scale, tolerance)
 
 
-@jit_compile
+@compile_borrowing
 def _take_step(scored: ScoredSamples, descent: _Descent, scale: float, tolerance: float) -> None:
     """Take the best of the proposed steps, or increase the damping if none gains."""
-    scored, descent = borrow((scored, descent))
     place, progress = descent.place, descent.progress
     if not progress.has_jacobian:
         fill_jacobian(scored, place, descent.error, descent.columns)
-        progress.has_jacobian = 1
+        progress.has_jacobian = True
         progress.evaluations += place.size
     tried = np.maximum(_DAMPINGS * progress.damping, _MIN_DAMPING)
     places, promised = _propose_places(descent, tried, scale)
     if promised <= tolerance * progress.loss:
-        progress.has_ended = 1
+        progress.has_ended = True
         return
     errors = compute_residuals(scored, places)
     progress.evaluations += N_TRIED
@@ -207,17 +205,16 @@ def _take_step(scored: ScoredSamples, descent: _Descent, scale: float, tolerance
         return
     gained = (progress.loss - value) / progress.loss
     place[:], descent.error[:] = places[best], errors[best]
-    progress.loss, progress.has_jacobian = value, 0
+    progress.loss, progress.has_jacobian = value, False
     damping = tried[best] if best > 0 else progress.damping * 1e-2
     progress.damping = min(max(damping, _MIN_DAMPING), _MAX_DAMPING)
     progress.idle_steps = progress.idle_steps + 1 if gained <= tolerance else 0
     progress.has_ended = progress.idle_steps == _MAX_IDLE_STEPS
 
 
-@jit_compile
+@compile_borrowing
 def _find_best(errors: FloatArray, value: float, scale: float) -> tuple[int, float]:
     """Find the residuals (P, n) of least loss below `value` (-1: none), and that loss."""
-    errors = borrow(errors)
     best = -1
     for p in range(errors.shape[0]):
         total = _sum_loss(errors[p], scale)
@@ -226,10 +223,9 @@ def _find_best(errors: FloatArray, value: float, scale: float) -> tuple[int, flo
     return best, value
 
 
-@jit_compile
+@compile_borrowing
 def compute_residuals(scored: ScoredSamples, places: FloatArray) -> FloatArray:
     """Compute the weighted residuals (P, n) of the scored values at places (P, D)."""
-    scored, places = borrow((scored, places))
     evaluator = scored.evaluator
     predicted = predict_partially(evaluator, from_unit(evaluator, places), 1.0)
     errors = np.empty((places.shape[0], scored.rows.size))
@@ -241,10 +237,9 @@ def compute_residuals(scored: ScoredSamples, places: FloatArray) -> FloatArray:
     return errors
 
 
-@jit_compile
+@compile_borrowing
 def _whiten(ar1_coefficient: FloatArray, errors: FloatArray) -> None:
     """Whiten residuals (P, n) in place by the AR(1) coefficient of each sample."""
-    ar1_coefficient, errors = borrow((ar1_coefficient, errors))
     for i in range(ar1_coefficient.size - 1, 0, -1):
         if ar1_coefficient[i] != 0.0:
             innovation_deviation = np.sqrt(1.0 - ar1_coefficient[i] * ar1_coefficient[i])
@@ -254,7 +249,7 @@ def _whiten(ar1_coefficient: FloatArray, errors: FloatArray) -> None:
                 ) / innovation_deviation
 
 
-@jit_compile
+@compile_borrowing
 def fill_jacobian(
     scored: ScoredSamples, place: FloatArray, error: FloatArray, columns: FloatArray
 ) -> None:
@@ -262,7 +257,6 @@ def fill_jacobian(
 
     Forward differences: one batch of D simulations.
     """
-    scored, place, error, columns = borrow((scored, place, error, columns))
     places, steps = step_aside(place, FINE_DIFFERENCE)
     errors = compute_residuals(scored, places[1:])
     for d in range(place.size):
@@ -283,12 +277,11 @@ def _sum_loss(error: FloatArray, scale: float) -> float:
     return total if np.isfinite(total) else np.inf
 
 
-@jit_compile
+@compile_borrowing
 def _propose_places(
     descent: _Descent, damping: FloatArray, scale: float
 ) -> tuple[FloatArray, float]:
     """Propose places (P, D) for dampings (P,); return them and the largest promised gain."""
-    descent, damping = borrow((descent, damping))
     place, promised = descent.place, 0.0
     matrix, gradient = form_normal_equations(descent.error, descent.columns, scale)
     places = np.empty((damping.size, place.size))

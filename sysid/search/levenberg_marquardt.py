@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
-from sysid.kernels.borrowing import borrow
+from sysid.kernels.borrowing import compile_borrowing
 from sysid.kernels.inner_products import N_SUMS, sum_products
 from sysid.simulation.loss import compute_loss as _plain_loss
 from sysid.simulation.loss import compute_loss_weight as _plain_weight
@@ -19,10 +19,9 @@ _compute_loss_weight = jit_compile(_plain_weight)
 FINE_DIFFERENCE = 1e-6  # of the range: far above rounding, far below the scale of curvature
 
 
-@jit_compile
+@compile_borrowing
 def compute_inner_product(first: FloatArray, second: FloatArray, count: int) -> float:
     """Compute the inner product of the first `count` entries, as four independent sums."""
-    first, second = borrow((first, second))
     whole = count // N_SUMS * N_SUMS
     sums: tuple[float, float, float, float] = sum_products(first, second, whole)
     a, b, c, d = sums
@@ -31,13 +30,12 @@ def compute_inner_product(first: FloatArray, second: FloatArray, count: int) -> 
     return (a + b) + (c + d)
 
 
-@jit_compile
+@compile_borrowing
 def step_aside(point: FloatArray, distance: float) -> tuple[FloatArray, FloatArray]:
     """Return a point (D,) with its D neighbours, (D + 1, D), and their signed distances (D,).
 
     Each neighbour differs in one parameter, away from the nearer bound.
     """
-    point = borrow(point)
     n = point.size
     places, steps = np.empty((n + 1, n)), np.empty(n)
     for d in range(n):
@@ -48,7 +46,7 @@ def step_aside(point: FloatArray, distance: float) -> tuple[FloatArray, FloatArr
     return places, steps
 
 
-@jit_compile
+@compile_borrowing
 def form_normal_equations(
     error: FloatArray, columns: FloatArray, scale: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -56,7 +54,6 @@ def form_normal_equations(
 
     Slopes may have more columns; the first n count.
     """
-    error, columns = borrow((error, columns))
     d, n = columns.shape[0], error.size
     if scale > 0.0:
         weighted_error, weighted_columns = np.empty(n), np.empty((d, n))
@@ -74,7 +71,7 @@ def form_normal_equations(
     return matrix, gradient
 
 
-@jit_compile
+@compile_borrowing
 def factor_damped(
     matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float
 ) -> FloatArray:
@@ -83,7 +80,6 @@ def factor_damped(
     These are parameters at a bound that would leave it, parameters without effect on the output,
     and parameters whose effect is a combination of others' (no positive pivot).
     """
-    matrix, gradient, point = borrow((matrix, gradient, point))
     n = point.size
     factor = np.zeros((n, n))
     for d in range(n):
@@ -116,10 +112,9 @@ def _move_within_bounds(point: FloatArray, step: FloatArray, place: FloatArray) 
         place[d] = min(max(point[d] + step[d], 0.0), 1.0)
 
 
-@jit_compile
+@compile_borrowing
 def solve_step(factor: FloatArray, gradient: FloatArray) -> FloatArray:
     """Solve the step p (D,) of L Lᵀ p = −g; parameters that stay get zero."""
-    factor, gradient = borrow((factor, gradient))
     step = np.zeros(gradient.size)
     for d in range(gradient.size):
         if factor[d, d] > 0.0:
@@ -131,7 +126,7 @@ def solve_step(factor: FloatArray, gradient: FloatArray) -> FloatArray:
     return step
 
 
-@jit_compile
+@compile_borrowing
 def write_damped_step(
     matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float, place: FloatArray
 ) -> float:
@@ -139,7 +134,6 @@ def write_damped_step(
 
     Returns the promised gain, −gᵀ times the step within the bounds: the linear part of the loss.
     """
-    matrix, gradient, point, place = borrow((matrix, gradient, point, place))
     step = solve_step(factor_damped(matrix, gradient, point, damping), gradient)
     _move_within_bounds(point, step, place)
     promised = 0.0
@@ -148,7 +142,7 @@ def write_damped_step(
     return promised
 
 
-@jit_compile
+@compile_borrowing
 def write_spread_place(
     factor: FloatArray, point: FloatArray, deviation: FloatArray, place: FloatArray
 ) -> None:
@@ -157,6 +151,5 @@ def write_spread_place(
     The distance is long where the output is insensitive, and short across the valley. `factor` is
     that of A.
     """
-    factor, point, deviation, place = borrow((factor, point, deviation, place))
     _solve_transposed(factor, deviation)
     _move_within_bounds(point, deviation, place)

@@ -16,20 +16,18 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, IntArray, WordArray
-from sysid.kernels.borrowing import borrow
+from sysid.kernels.borrowing import compile_borrowing
 
 RandomWords: TypeAlias = tuple[Any, Any, Any, Any]
 """Four independent words of 32 bits, as integers."""
 
 # Uses of random numbers, one word of the counter.
-USE_INITIAL, USE_STRATA, USE_CHILDREN, USE_LOCAL_SEARCH, USE_RESTART, USE_WARM_START = (
-    1,
-    2,
-    3,
-    4,
-    5,
-    6,
-)
+USE_INITIAL = 1
+USE_STRATA = 2
+USE_CHILDREN = 3
+USE_LOCAL_SEARCH = 4
+USE_RESTART = 5
+USE_WARM_START = 6
 
 _MASK = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
@@ -70,10 +68,9 @@ def to_normal(word: RandomWords) -> float:
     )
 
 
-@jit_compile
+@compile_borrowing
 def encode(places: FloatArray, bits: int) -> WordArray:
     """Encode places in [0, 1] as the nearest chromosomes."""
-    places = borrow(places)
     largest = float((1 << bits) - 1)
     words = np.empty(places.shape, np.uint32)
     for p in range(places.shape[0]):
@@ -82,10 +79,9 @@ def encode(places: FloatArray, bits: int) -> WordArray:
     return words
 
 
-@jit_compile
+@compile_borrowing
 def decode(words: WordArray, bits: int) -> FloatArray:
     """Decode chromosomes to places in [0, 1]; the inverse of `encode`."""
-    words = borrow(words)
     largest = float((1 << bits) - 1)
     places = np.empty(words.shape)
     for p in range(words.shape[0]):
@@ -94,13 +90,12 @@ def decode(words: WordArray, bits: int) -> FloatArray:
     return places
 
 
-@jit_compile
+@compile_borrowing
 def sort_population(words: WordArray, fitness: FloatArray) -> None:
     """Sort a population in place, fittest first; equal ones keep their order.
 
     Insertion sort: populations are small, and half of them is in order after a generation.
     """
-    words, fitness = borrow((words, fitness))
     order, is_sorted = np.empty(fitness.size, np.int64), True
     for p in range(fitness.size):
         value, index = fitness[p], p

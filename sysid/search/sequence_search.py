@@ -72,4 +72,4 @@ def run_fixed_sequence(evaluator: Evaluator, plan: IslandPlan, island: IslandArr
         return
     search.failed_steps += 1
     if search.failed_steps == 2:
-        search.in_sequence_search, search.failed_steps = 0, 0
+        search.in_sequence_search, search.failed_steps = False, 0

@@ -7,7 +7,7 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
-from sysid.kernels.borrowing import borrow
+from sysid.kernels.borrowing import compile_borrowing
 from sysid.search.levenberg_marquardt import (
     FINE_DIFFERENCE,
     compute_loss,
@@ -20,12 +20,11 @@ from sysid.simulation.evaluator import Evaluator, predict_partially
 from sysid.simulation.scaling import from_unit
 
 
-@jit_compile
+@compile_borrowing
 def evaluate_partial_fitness(
     evaluator: Evaluator, plan: IslandPlan, predicted: FloatArray, horizon: float
 ) -> FloatArray:
     """Compute the fitness of each column of predictions (M, P) up to `horizon` (1: all)."""
-    evaluator, plan, predicted = borrow((evaluator, plan, predicted))
     totals, count = np.zeros(predicted.shape[1]), 0
     for m in range(predicted.shape[0]):
         weight, measured = evaluator.weight[m], evaluator.measured[m]
@@ -48,18 +47,17 @@ def choose_difference(plan: IslandPlan, search: SearchRecord) -> float:
     step. Where switching (dry friction) makes the fitness rough, such slopes look past the next
     ripple, and no ripple stops all of them.
     """
-    if search.wide_differences == 0:
+    if not search.wide_differences:
         return FINE_DIFFERENCE
     word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, 0)
     return float(10.0 ** (-2.0 - 4.0 * to_uniform(word[2])))
 
 
-@jit_compile
+@compile_borrowing
 def build_normal_equations(
     evaluator: Evaluator, plan: IslandPlan, point: FloatArray, horizon: float, difference: float
 ) -> tuple[FloatArray, FloatArray, float]:
     """Compute JᵀJ, Jᵀe and the fitness at a point up to `horizon`, in D + 1 simulations."""
-    evaluator, plan, point = borrow((evaluator, plan, point))
     n, (places, steps) = point.size, step_aside(point, difference)
     predicted = predict_partially(evaluator, from_unit(evaluator, places), horizon)
     weights, measured, progress = evaluator.weight, evaluator.measured, plan.progress

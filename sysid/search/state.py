@@ -74,28 +74,29 @@ class KnownFitness(NamedTuple):
 
 
 class SearchRecord(Protocol):
-    """State of the search of an island. Fields that read as statements are 0 or 1."""
+    """State of the search of an island."""
 
     generation: int
     evaluations: int
     stagnation: int  # generations since the last better champion
-    in_sequence_search: int
+    in_sequence_search: bool
     step_count: int  # of this sequence search, or generations since the last one
     failed_steps: int  # in succession
     local_searches: int  # started so far
-    champion_converged: int  # a local search of the champion has ended
+    champion_converged: bool  # a local search of the champion has ended
     probe_count: int
-    from_random_start: int  # this local search began at a random point
+    from_random_start: bool  # this local search began at a random point
     random_starts: int  # ended local searches from random points
     confirmed_starts: int  # of these, those that led to the champion
-    hop_kind: int  # 0: this local search is no hop
+    hop: int  # of this local search, as `sysid.search.schedule.LocalSearch` says
+    hop_is_evidence: bool
     hop_count: int  # ended hops
     returned_hops: int  # of these, those that led back to the champion
     champion_discontinuities: int  # lines through this champion on which the fitness jumps
-    champion_explained: int  # its residuals were noise when a hop last returned to it
-    is_warm_start: int
+    champion_explained: bool  # its residuals were noise when a hop last returned to it
+    is_warm_start: bool
     fitness_discontinuities: int  # the same for any champion, and for those of neighbours
-    wide_differences: int  # slopes are taken over random distances
+    wide_differences: bool  # slopes are taken over random distances
     damping: float
     horizon: float  # part of the record that is fitted
     horizon_growth: float  # factor from one part to the next

@@ -9,10 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, IntArray
 from sysid.kernels.abi import NARROW_LANES
-from sysid.kernels.borrowing import borrow
+from sysid.kernels.borrowing import compile_borrowing
 from sysid.kernels.calls import call_kernel
 from sysid.kernels.layout import HEAD_FIELDS
 
@@ -67,10 +66,9 @@ class Evaluator(NamedTuple):
 _LAST_STEP = HEAD_FIELDS.index("last")
 
 
-@jit_compile
+@compile_borrowing
 def expand_individuals(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     """Expand individuals (P, D) to all parameters in the kernel's layout, (K, P rounded up)."""
-    evaluator, theta = borrow((evaluator, theta))
     individuals, free = theta.shape
     stride = (individuals + NARROW_LANES - 1) // NARROW_LANES * NARROW_LANES
     full = np.empty((evaluator.template.size, stride))
@@ -83,11 +81,10 @@ def expand_individuals(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     return full
 
 
-@jit_compile
+@compile_borrowing
 def _run_kernels(
     evaluator: Evaluator, ints: IntArray, full: FloatArray, predictions: FloatArray
 ) -> FloatArray:
-    evaluator, ints, full, predictions = borrow((evaluator, ints, full, predictions))
     loss = np.zeros(full.shape[1])
     if full.shape[1] == 0:
         return loss
@@ -108,10 +105,9 @@ def _run_kernels(
     return loss
 
 
-@jit_compile
+@compile_borrowing
 def evaluate_population(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     """Compute J of each individual (Eq. 10): (P, D) → (P,), inf if diverged. Smaller is better."""
-    evaluator, theta = borrow((evaluator, theta))
     loss = _run_kernels(
         evaluator, evaluator.ints, expand_individuals(evaluator, theta), np.empty((0, 1))
     )
@@ -122,24 +118,22 @@ def evaluate_population(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     return fitness
 
 
-@jit_compile
+@compile_borrowing
 def predict_population(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     """Simulate the values at the measured times: (P, D) → (P, M), not finite where it diverges."""
-    evaluator, theta = borrow((evaluator, theta))
     full = expand_individuals(evaluator, theta)
     predictions = np.empty((evaluator.n_measured, full.shape[1]))
     _run_kernels(evaluator, evaluator.ints, full, predictions)
     return np.ascontiguousarray(predictions[:, : theta.shape[0]].T)
 
 
-@jit_compile
+@compile_borrowing
 def predict_partially(evaluator: Evaluator, theta: FloatArray, horizon: float) -> FloatArray:
     """Simulate the first part of each experiment: values (M, P rounded up).
 
     The simulation stops after the share `horizon` (0 … 1) of the steps, and costs that share.
     Values of later samples and in columns from P on are arbitrary.
     """
-    evaluator, theta = borrow((evaluator, theta))
     ints = evaluator.ints.copy()
     for e in range(evaluator.offsets.shape[0]):
         last = evaluator.offsets[e, 0] + _LAST_STEP

@@ -2,16 +2,14 @@
 
 import numpy as np
 
-from sysid.core.jit import jit_compile
 from sysid.core.types import BoolArray, FloatArray
-from sysid.kernels.borrowing import borrow
+from sysid.kernels.borrowing import compile_borrowing
 from sysid.simulation.evaluator import Evaluator
 
 
-@jit_compile
+@compile_borrowing
 def from_unit(evaluator: Evaluator, places: FloatArray) -> FloatArray:
     """Convert positions in [0, 1] to physical values: (P, D) → (P, D)."""
-    evaluator, places = borrow((evaluator, places))
     theta = np.empty(places.shape)
     for d in range(places.shape[1]):
         lower, upper = evaluator.lower[d], evaluator.upper[d]
@@ -24,10 +22,9 @@ def from_unit(evaluator: Evaluator, places: FloatArray) -> FloatArray:
     return theta
 
 
-@jit_compile
+@compile_borrowing
 def to_unit(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     """Convert physical values to positions, the inverse of `from_unit`; clipped to the bounds."""
-    evaluator, theta = borrow((evaluator, theta))
     places = np.empty(theta.shape)
     for d in range(theta.shape[1]):
         lower, upper = evaluator.lower[d], evaluator.upper[d]

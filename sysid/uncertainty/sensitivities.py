@@ -24,10 +24,8 @@ from sysid.simulation.scaling import from_unit, to_unit
 _DIFFERENCE_STEP = 1e-5  # of the range
 _SLOPE_AGREEMENT = 0.1  # of a slope: two that differ by less do not straddle a jump
 _SEGMENT_EDGES = np.array([1e-6, _DIFFERENCE_STEP, 1e-4, 1e-3, 1e-2])  # of segments, of the range
-_STEP_GROWTH, _MAX_STEP = (
-    4.0,
-    0.7,
-)  # of the step of the search for a jump; the largest, of the range
+_STEP_GROWTH = 4.0  # from one step of the search for a jump to the next
+_MAX_STEP = 0.7  # of the range: the last step of that search
 _HALVINGS = 6  # locate a jump to about 1 % of its distance
 
 

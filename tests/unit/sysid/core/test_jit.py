@@ -109,7 +109,7 @@ def what_is_compiled(value: ast.expr) -> ast.expr:
 
 def is_compiled(function: ast.FunctionDef) -> bool:
     marks = {one.id for one in function.decorator_list if isinstance(one, ast.Name)}
-    return bool(marks & {"jit_compile", "intrinsic"})
+    return bool(marks & {"jit_compile", "compile_borrowing", "intrinsic"})
 
 
 def names_in(node: ast.AST) -> set[str]:

@@ -6,9 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
-from sysid.kernels.borrowing import borrow
+from sysid.kernels.borrowing import compile_borrowing
 
 
 class Pair(NamedTuple):
@@ -26,9 +25,8 @@ class Nested(NamedTuple):
     third: FloatArray
 
 
-@jit_compile
+@compile_borrowing
 def _add_up(pair: Pair, scratch: FloatArray) -> float:
-    pair, scratch = borrow((pair, scratch))
     total = 0.0
     for i in range(pair.first.size):
         scratch[i] = pair.factor * pair.first[i] + pair.second[i]
@@ -36,9 +34,8 @@ def _add_up(pair: Pair, scratch: FloatArray) -> float:
     return total
 
 
-@jit_compile
+@compile_borrowing
 def add_up_repeatedly(nested: Nested, turns: int) -> float:
-    nested = borrow(nested)
     total = 0.0
     for _ in range(turns):
         total += _add_up(nested.pair, nested.third)
@@ -68,10 +65,10 @@ def test_references_to_borrowed_arrays_are_neither_lost_nor_added() -> None:
     assert [sys.getrefcount(array) for array in arrays] == before
 
 
-@jit_compile
+@compile_borrowing
 def return_borrowed(values: FloatArray) -> FloatArray:
     """Only a test may do this: nothing holds the memory of the result."""
-    return np.asarray(borrow(values))
+    return np.asarray(values)
 
 
 def test_a_borrowed_array_has_no_count_of_its_own() -> None:

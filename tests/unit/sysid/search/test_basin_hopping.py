@@ -6,12 +6,8 @@ import pytest
 from sysid.core.settings import GeneticAlgorithm, Stop
 from sysid.core.types import FloatArray
 from sysid.islands.archipelago import create_islands, make_plans
-from sysid.search.basin_hopping import (
-    COUNTED_HOP,
-    SINGLE_PARAMETER_HOP,
-    UNCOUNTED_HOP,
-    hop_from_champion,
-)
+from sysid.search.basin_hopping import hop_from_champion
+from sysid.search.schedule import HOP_ALONG_COVARIANCE, HOP_IN_ONE_PARAMETER
 from sysid.search.slopes import build_normal_equations
 from sysid.simulation.evaluator import Evaluator
 from sysid.simulation.scaling import to_unit
@@ -26,11 +22,14 @@ BEGIN = to_unit(PROBLEM.evaluator, np.array([[COULOMB[p.name] for p in PROBLEM.f
 DRAWN = 400
 
 
-def moved(kind: int, evaluator: Evaluator = PROBLEM.evaluator) -> FloatArray:
+def moved(
+    hop: int, is_evidence: bool = True, evaluator: Evaluator = PROBLEM.evaluator
+) -> FloatArray:
     """How far hops of that kind lead (DRAWN, D), each by its own draw."""
     island = create_islands(PROBLEM, ALONE, 3)[0]
     search, ends = island.search, np.empty((DRAWN, BEGIN.size))
-    search["hop_kind"], search["hop_count"] = kind, 4  # four hops have looked for jumps
+    search["hop"], search["hop_is_evidence"] = hop, is_evidence
+    search["hop_count"] = 4  # four hops have looked for jumps
     for k in range(DRAWN):
         search["generation"], before = k, island.evaluations
         island.point[:] = BEGIN
@@ -40,18 +39,19 @@ def moved(kind: int, evaluator: Evaluator = PROBLEM.evaluator) -> FloatArray:
     return ends - BEGIN
 
 
-@pytest.mark.parametrize(
-    "kind", [COUNTED_HOP + SINGLE_PARAMETER_HOP, UNCOUNTED_HOP + SINGLE_PARAMETER_HOP]
-)
-def test_a_hop_of_one_parameter_moves_each_of_them_in_its_turn_and_no_other(kind: int) -> None:
-    moves = moved(kind)
+@pytest.mark.parametrize("is_evidence", [True, False])
+def test_a_hop_of_one_parameter_moves_each_of_them_in_its_turn_and_no_other(
+    is_evidence: bool,
+) -> None:
+    moves = moved(HOP_IN_ONE_PARAMETER, is_evidence)
     assert np.all(np.sum(moves != 0.0, axis=1) == 1)
     assert np.all(np.abs(np.sum(moves != 0.0, axis=0) - DRAWN / 4) < 5 * np.sqrt(DRAWN * 3 / 16))
-    assert np.all(np.sum(moved(kind - SINGLE_PARAMETER_HOP) != 0.0, axis=1) == BEGIN.size)
+    others = moved(HOP_ALONG_COVARIANCE, is_evidence)
+    assert np.all(np.sum(others != 0.0, axis=1) == BEGIN.size)
 
 
 def test_it_leads_3_to_500_standard_errors_of_a_parameter_whose_fellows_are_held() -> None:
-    moves = moved(COUNTED_HOP + SINGLE_PARAMETER_HOP)
+    moves = moved(HOP_IN_ONE_PARAMETER)
     search = create_islands(PROBLEM, ALONE, 3)[0].search
     assert search["wide_differences"] == 0  # hops take the same derivatives
     matrix, _, base = build_normal_equations(PROBLEM.evaluator, PLAN, BEGIN, 1.0, 1e-6)
@@ -67,19 +67,17 @@ def test_it_leads_3_to_500_standard_errors_of_a_parameter_whose_fellows_are_held
 
 def test_a_parameter_that_changes_nothing_stays() -> None:
     blind = PROBLEM.evaluator._replace(weight=np.zeros_like(PROBLEM.evaluator.weight))
-    assert np.all(moved(COUNTED_HOP + SINGLE_PARAMETER_HOP, blind) == 0.0)
+    assert np.all(moved(HOP_IN_ONE_PARAMETER, evaluator=blind) == 0.0)
 
 
-@pytest.mark.parametrize(("kind", "looks"), [(COUNTED_HOP, True), (UNCOUNTED_HOP, False)])
-def test_hops_that_are_evidence_look_for_jumps_whichever_way_they_lead(
-    kind: int, looks: bool
-) -> None:
+@pytest.mark.parametrize("is_evidence", [True, False])
+def test_hops_that_are_evidence_look_for_jumps_whichever_way_they_lead(is_evidence: bool) -> None:
     """Whether the fitness jumps decides what settles a search: all of the first hops have to."""
-    for one in (0, SINGLE_PARAMETER_HOP):
+    for hop in (HOP_ALONG_COVARIANCE, HOP_IN_ONE_PARAMETER):
         island = create_islands(PROBLEM, ALONE, 3)[0]
-        island.search["hop_kind"] = kind + one
+        island.search["hop"], island.search["hop_is_evidence"] = hop, is_evidence
         island.point[:] = BEGIN
         spent = island.evaluations + BEGIN.size + 1
         hop_from_champion(PROBLEM.evaluator, PLAN, island.arrays)
-        assert (island.evaluations > spent) == looks
-        assert island.search["champion_discontinuities"] == 0 or looks
+        assert (island.evaluations > spent) == is_evidence
+        assert island.search["champion_discontinuities"] == 0 or is_evidence

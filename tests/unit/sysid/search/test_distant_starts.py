@@ -99,7 +99,7 @@ def test_a_champion_whose_errors_are_no_noise_lets_fresh_starts_have_the_turns_o
         search["fitness_discontinuities"] = search["champion_converged"] = 1
         search["local_searches"] = turn - 1
         start_local_search(PROBLEM.evaluator, plan(), island.arrays)
-        seen += "f" if search["from_random_start"] else "h" if search["hop_kind"] else "?"
+        seen += "f" if search["from_random_start"] else "h" if search["hop"] else "?"
         assert (search["horizon"] <= 0.25) == bool(search["from_random_start"])
     assert seen == kinds
 

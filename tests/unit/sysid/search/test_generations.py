@@ -146,16 +146,12 @@ def test_a_restart_keeps_the_champion_and_draws_all_others_again() -> None:
 
 @pytest.mark.parametrize(("gain", "left"), [(2e-4, 0), (5e-5, 3), (0.0, 3)])
 def test_evidence_is_kept_for_the_same_optimum_only(gain: float, left: int) -> None:
-    fields = (
-        "confirmed_starts",
-        "champion_discontinuities",
-        "champion_explained",
-        "hop_count",
-        "returned_hops",
-    )
-    island = with_search(begin()[0], random_starts=5, **dict.fromkeys(fields, 3))
+    fields = ("confirmed_starts", "champion_discontinuities", "hop_count", "returned_hops")
+    counts = dict.fromkeys(fields, 3)
+    island = with_search(begin()[0], random_starts=5, champion_explained=True, **counts)
     reset_evidence(island.arrays.search, 0.5 * (1.0 - gain), 0.5)
-    assert [int(island.search[name]) for name in fields] == [left] * 5
+    assert [int(island.search[name]) for name in fields] == [left] * 4
+    assert island.search["champion_explained"] == (left > 0)
     assert island.search["random_starts"] == 5
 
 

@@ -7,13 +7,15 @@ import pytest
 
 from sysid.core.settings import GeneticAlgorithm, Stop
 from sysid.islands.archipelago import create_islands, make_plans
-from sysid.search.basin_hopping import COUNTED_HOP, SINGLE_PARAMETER_HOP, UNCOUNTED_HOP
 from sysid.search.island import Island, evolve
-from sysid.search.state import SAME_OPTIMUM
+from sysid.search.schedule import GROW_NEARBY, HOP, NO_HOP, SINGLE_HOP
+from sysid.search.state import SAME_OPTIMUM, SearchArray
 from tests.searching import bits, example
 
 ALONE = GeneticAlgorithm(population=12, islands=1, stop=Stop(evaluations=6_000))
 GENERATIONS = 400
+NO_EVIDENCE = (NO_HOP, False)
+HOPS = [(kind.hop, kind.is_evidence) for kind in (HOP, SINGLE_HOP, GROW_NEARBY)]
 
 
 @cache
@@ -27,10 +29,10 @@ def generations(model: str) -> tuple[Island, ...]:
     return tuple(states)
 
 
-def begun(model: str, field: str) -> list[int]:
-    """That field in each development which was begun after jumps had been met, or in any."""
+def begun(model: str) -> list[SearchArray]:
+    """Each development as it was begun after jumps had been met, or any."""
     return [
-        int(after.search[field])
+        after.search
         for before, after in pairwise(generations(model))
         if after.search["local_searches"] > before.search["local_searches"] > 4
         and (before.search["fitness_discontinuities"] > 0 or model == "duffing-eq16")
@@ -51,34 +53,31 @@ def test_jumps_once_met_stay_known_when_a_better_champion_comes() -> None:
 
 
 def test_there_most_developments_are_hops_and_some_still_begin_anywhere() -> None:
-    hops = begun("coulomb-eq16", "hop_kind")
+    hops = [get_hop(search) for search in begun("coulomb-eq16")]
     assert len(hops) > 30
-    assert sum(hop > 0 for hop in hops) >= 0.4 * len(hops)
-    assert {
-        COUNTED_HOP,
-        COUNTED_HOP + SINGLE_PARAMETER_HOP,
-        UNCOUNTED_HOP + SINGLE_PARAMETER_HOP,
-    } <= set(hops)
-    assert sum(begun("coulomb-eq16", "from_random_start")) >= 2
-    smooth = begun("duffing-eq16", "hop_kind")
-    assert set(smooth) == {0, COUNTED_HOP}
-    assert sum(hop > 0 for hop in smooth) < 0.6 * len(smooth)
+    assert sum(hop != NO_EVIDENCE for hop in hops) >= 0.4 * len(hops)
+    assert set(HOPS) <= set(hops)
+    assert sum(bool(search["from_random_start"]) for search in begun("coulomb-eq16")) >= 2
+    smooth = [get_hop(search) for search in begun("duffing-eq16")]
+    assert set(smooth) == {NO_EVIDENCE, HOPS[0]}
+    assert sum(hop != NO_EVIDENCE for hop in smooth) < 0.6 * len(smooth)
+
+
+def get_hop(search: SearchArray) -> tuple[int, bool]:
+    """Get the kind of hop of a search, and whether it counts as evidence."""
+    return int(search["hop"]), bool(search["hop_is_evidence"])
 
 
 def test_growing_from_beside_the_champion_is_no_evidence_for_it() -> None:
     """It need not lead back where a better one lies near, so it tells nothing of the champion."""
     states = generations("coulomb-eq16")
-    ends = {
-        COUNTED_HOP: 0,
-        COUNTED_HOP + SINGLE_PARAMETER_HOP: 0,
-        UNCOUNTED_HOP + SINGLE_PARAMETER_HOP: 0,
-    }
+    ends = dict.fromkeys(HOPS, 0)
     for before, after in pairwise(states):
-        hop = int(before.search["hop_kind"])
+        hop = get_hop(before.search)
         ended = before.search["in_sequence_search"] == 1 and after.search["in_sequence_search"] == 0
-        if ended and hop and after.champion_rms == before.champion_rms:
+        if ended and hop != NO_EVIDENCE and after.champion_rms == before.champion_rms:
             ends[hop] += 1
-            assert after.search["hop_count"] - before.search["hop_count"] == (hop & COUNTED_HOP > 0)
+            assert after.search["hop_count"] - before.search["hop_count"] == hop[1]
             assert after.search["step_count"] == 0
     assert min(ends.values()) > 0
 
@@ -103,7 +102,7 @@ def test_a_local_search_that_leads_to_the_champion_confirms_it_and_another_does_
         )
         if not ends or after.champion_rms < before.champion_rms:
             continue
-        is_random, is_hop = bool(new["from_random_start"]), bool(new["hop_kind"] & COUNTED_HOP)
+        is_random, is_hop = bool(new["from_random_start"]), bool(new["hop_is_evidence"])
         relative = new["reached_fitness"] / after.champion_rms - 1.0
         led_back = bool(abs(relative) <= SAME_OPTIMUM)
         ended.append((is_random, is_hop, led_back))
