@@ -80,7 +80,7 @@ def predictions(problem: Problem, theta: FloatArray, one_step: bool = False) -> 
             grid = twin.outputs()
             for i, samples in enumerate(experiment.outputs):
                 places = np.arange(experiment.grid.points)
-                parts.append(np.interp(samples.places, places, grid[i]))
+                parts.append(np.interp(samples.positions, places, grid[i]))
     return np.concatenate(parts)
 
 

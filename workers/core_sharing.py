@@ -36,8 +36,8 @@ def divide_cores(n_cores: int, wanted: Mapping[str, int]) -> dict[str, int]:
     """
     shares: dict[str, int] = {}
     left = n_cores
-    for place, name in enumerate(sorted(wanted, key=lambda name: (wanted[name], name))):
-        share = min(wanted[name], left // (len(wanted) - place))
+    for index, name in enumerate(sorted(wanted, key=lambda name: (wanted[name], name))):
+        share = min(wanted[name], left // (len(wanted) - index))
         shares[name] = max(share, 1)
         left -= share
     return shares

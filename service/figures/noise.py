@@ -10,7 +10,7 @@ from service.sweeps.cramer_rao import scale_to_median
 from service.sweeps.schemas import GroupOut, ParameterSummaryOut, SummaryOut
 from sysid.core.text import append_unit, bracket_unit
 from sysid.figures import theme
-from sysid.figures.grid import WIDE_MARGIN, Place, add_axes, add_caption, wide_grid
+from sysid.figures.grid import WIDE_MARGIN, PlotArea, add_axes, add_caption, wide_grid
 from sysid.figures.plotly import Figure, base_layout, to_json_numbers
 
 METHOD_PATH = "/algorithm/method"
@@ -73,7 +73,7 @@ def plot_noise_sweep(summary: SummaryOut, unit: str, columns: int = 2) -> Figure
     }
     in_legend: set[str] = set()
     for number, panel in enumerate(panels):
-        _add_panel(figure, number, panel, grid.place(number), unit, in_legend)
+        _add_panel(figure, number, panel, grid.get_area(number), unit, in_legend)
     return figure
 
 
@@ -150,7 +150,7 @@ def _line_style(name: str, number: int) -> dict[str, Any]:
 
 
 def _add_panel(
-    figure: Figure, number: int, panel: _Panel, domain: Place, unit: str, in_legend: set[str]
+    figure: Figure, number: int, panel: _Panel, domain: PlotArea, unit: str, in_legend: set[str]
 ) -> None:
     small = {"size": 11}
     axis_names = add_axes(

@@ -29,7 +29,7 @@ def plot_profiles(profiles: Sequence[ProfileOut], threshold: float, columns: int
         axis_names = add_axes(
             figure,
             number,
-            grid.place(number),
+            grid.get_area(number),
             {"title": {"text": append_unit(profile.name, profile.unit)}, "nticks": 6},
             {
                 "nticks": 5,

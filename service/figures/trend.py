@@ -6,7 +6,7 @@ from service.core.text import name_label
 from service.trends.schemas import LawOut, LawPointOut, PointOut, QuantityOut, TrendOut
 from sysid.core.text import append_unit, format_number
 from sysid.figures import theme
-from sysid.figures.grid import WIDE_MARGIN, Place, add_axes, add_caption, wide_grid
+from sysid.figures.grid import WIDE_MARGIN, PlotArea, add_axes, add_caption, wide_grid
 from sysid.figures.plotly import Figure, base_layout, to_json_numbers
 
 _BAND = "rgba(42,131,196,0.15)"
@@ -35,7 +35,7 @@ def plot_trend(trend: TrendOut, columns: int = 2) -> Figure:
     }
     in_legend: set[str] = set()
     for number, quantity in enumerate(shown):
-        axis_names = _add_axes(figure, number, quantity, trend.x, grid.place(number))
+        axis_names = _add_axes(figure, number, quantity, trend.x, grid.get_area(number))
         for trace in _quantity_traces(quantity):
             name = trace["legendgroup"]
             first = name not in in_legend and trace.get("showlegend", True)
@@ -61,7 +61,7 @@ def _list_drawn(trend: TrendOut) -> list[QuantityOut]:
 
 
 def _add_axes(
-    figure: Figure, number: int, quantity: QuantityOut, x: str, domain: Place
+    figure: Figure, number: int, quantity: QuantityOut, x: str, domain: PlotArea
 ) -> AxisNames:
     small = {"size": 11}
     axis_names = add_axes(

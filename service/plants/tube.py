@@ -356,8 +356,8 @@ def build_excitation(pattern: int, length_m: float, times: FloatArray) -> FloatA
     if pattern != 2:
         raise InvalidSettings("/parameters/pattern", f"found {pattern}; need 1 or 2")
     bits = _generate_binary_sequence(32)
-    places = np.floor((clock - 0.5) / 0.6).astype(np.int64)
-    binary = np.where(places < 0, 0.0, bits[np.clip(places, 0, bits.size - 1)])
+    indices = np.floor((clock - 0.5) / 0.6).astype(np.int64)
+    binary = np.where(indices < 0, 0.0, bits[np.clip(indices, 0, bits.size - 1)])
     late = np.clip(clock - 18.0, 0.0, 12.0) / 12.0
     chirp = np.sin(2 * pi * 0.05 * 12.0 / np.log(16.0) * (16.0**late - 1.0))
     return np.asarray(1e6 * (0.25 + 0.15 * np.where(clock < 18.0, binary, chirp)))

@@ -129,9 +129,9 @@ def _count_fine_points(identified: IdentifiedModel) -> int:
 
 
 def _compute_held_taps(delay: float, ramp: float) -> dict[int, float]:
-    place = -delay + ramp
-    nearest = floor(place + 0.5)
-    part = min(max((place - nearest + ramp) / (2 * ramp), 0.0), 1.0)
+    position = -delay + ramp
+    nearest = floor(position + 0.5)
+    part = min(max((position - nearest + ramp) / (2 * ramp), 0.0), 1.0)
     return {1 - nearest: 1.0 - part, -nearest: part}
 
 

@@ -190,7 +190,7 @@ class UnreadableFile(SysidError, ValueError):
     ) -> None:
         self.what, self.advice, self.name = what, advice, ""
         self.row, self.column, self.byte = row, column, byte
-        self.detail = f"{self._format_place()}{what}{advice or ''}"
+        self.detail = f"{self._format_position()}{what}{advice or ''}"
         super().__init__(self.detail)
 
     def __str__(self) -> str:
@@ -198,14 +198,14 @@ class UnreadableFile(SysidError, ValueError):
 
     @property
     def pointer(self) -> str:
-        """JSON pointer of the place, such as ``/rows/2/u`` or ``/bytes/90``."""
+        """JSON pointer of the fault, such as ``/rows/2/u`` or ``/bytes/90``."""
         if self.byte is not None:
             return f"/bytes/{self.byte}"
         parts = [] if self.row is None else ["rows", str(self.row)]
         parts += [] if self.column is None else [self.column]
         return join_pointer(*parts)
 
-    def _format_place(self) -> str:
+    def _format_position(self) -> str:
         if self.byte is not None:
             return f"at byte {self.byte}: "
         parts = [] if self.row is None else [f"row {self.row}"]

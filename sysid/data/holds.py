@@ -47,13 +47,13 @@ def choose_hold(values: FloatArray) -> HoldChoice:
     span = float(np.ptp(values)) if values.size else 0.0
     if not span > 0:
         return HoldChoice("first", "is constant, so that its hold has no effect")
-    places = np.round((values - np.min(values)) / (_ROUNDING_SHARE * span))
-    steps = np.diff(places)
+    rounded = np.round((values - np.min(values)) / (_ROUNDING_SHARE * span))
+    steps = np.diff(rounded)
     jumps = np.flatnonzero(steps)
-    levels = np.unique(places)
+    levels = np.unique(rounded)
     if levels.size == 2:
         return HoldChoice("zero", "has two levels")
-    lengths = np.diff(np.concatenate([[0], jumps + 1, [places.size]]))
+    lengths = np.diff(np.concatenate([[0], jumps + 1, [rounded.size]]))
     if _is_quantised(steps[jumps], levels, lengths):
         return HoldChoice(
             "first", "moves and is quantised: it has many levels, and jumps from one to the next"

@@ -134,8 +134,8 @@ def _count_points(channel: Channel, start: float, step: float) -> int:
 
 
 def _is_aligned(times: FloatArray, start: float, spacing: float) -> bool:
-    places = (times - start) / spacing
-    return bool(np.max(np.abs(places - np.round(places))) < _JITTER)
+    positions = (times - start) / spacing
+    return bool(np.max(np.abs(positions - np.round(positions))) < _JITTER)
 
 
 def estimate_sampling_period(channel: Channel) -> float | None:
@@ -200,9 +200,9 @@ def _interpolate_band_limited(channel: Channel, times: FloatArray) -> FloatArray
     dense = upfirdn(kernel, extended, up=POINTS_PER_SAMPLE)[_HALF_WIDTH * POINTS_PER_SAMPLE :]
     first = (margin - 1) * POINTS_PER_SAMPLE
     dense = dense[first : first + (values.size + 1) * POINTS_PER_SAMPLE + 1]
-    places = (np.arange(dense.size) / POINTS_PER_SAMPLE - 1.0) * sampling.period + channel.times[0]
+    points = (np.arange(dense.size) / POINTS_PER_SAMPLE - 1.0) * sampling.period + channel.times[0]
     inside = np.clip(times, channel.times[0], channel.times[-1])
     if dense.size == 0:
         return np.interp(times, channel.times, values)
-    interpolated: FloatArray = CubicSpline(places, dense)(inside)
+    interpolated: FloatArray = CubicSpline(points, dense)(inside)
     return interpolated

@@ -192,14 +192,14 @@ class Channel:
         times, owner = self.times, f"the times of channel {self.name!r}"
         infinite = np.flatnonzero(~np.isfinite(times))
         if infinite.size:
-            place = infinite[0]
-            raise InvalidRecord(f"{owner} are not finite: sample {place + 1} is at {times[place]}")
+            index = infinite[0]
+            raise InvalidRecord(f"{owner} are not finite: sample {index + 1} is at {times[index]}")
         backward = np.flatnonzero(np.diff(times) < 0)
         if backward.size:
-            place = backward[0]
+            index = backward[0]
             raise InvalidRecord(
-                f"{owner} decrease: sample {place + 1} is at {times[place]:g} s, the next at "
-                f"{times[place + 1]:g} s. Sort the samples by time"
+                f"{owner} decrease: sample {index + 1} is at {times[index]:g} s, the next at "
+                f"{times[index + 1]:g} s. Sort the samples by time"
             )
 
     def _check_history(self, history: History) -> None:
@@ -347,8 +347,8 @@ def _iterate_channels(group: Any, owner: str) -> Iterator[Channel]:
 def to_channel(column: Column, otherwise: str = "") -> Channel:
     """Read a column of a table as a channel; `otherwise` is its name if it has none.
 
-    What is refused or told of a file is so of a table: infinite and missing values, and times that
-    repeat.
+    What is refused or reported of a file is so of a table: infinite and missing values, and times
+    that repeat.
     """
     name, (times, start) = column.name or otherwise, column.axis
     channel = Channel(name, times, column.values, column.unit, started_at=start)

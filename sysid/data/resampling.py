@@ -100,11 +100,11 @@ def _interpolate_values(channel: Channel, grid: FloatArray, period: float) -> Fl
 def _average_periods(channel: Channel, grid: FloatArray, period: float) -> FloatArray:
     if channel.hold == "zero":
         return _average_held_periods(channel, grid, period)
-    places = (channel.times - grid[0]) / period + 0.5
+    positions = (channel.times - grid[0]) / period + 0.5
     counts, sums = np.zeros(grid.size), np.zeros(grid.size)
     # A sample on the border of two periods counts half in each; otherwise the mean is too early.
     for border in (-_BORDER_TOLERANCE, _BORDER_TOLERANCE):
-        numbers = np.floor(places + border).astype(np.int64)
+        numbers = np.floor(positions + border).astype(np.int64)
         inside = (numbers >= 0) & (numbers < grid.size)
         counts += np.bincount(numbers[inside], minlength=grid.size)
         sums += np.bincount(numbers[inside], weights=channel.values[inside], minlength=grid.size)

@@ -179,15 +179,15 @@ def find_time_column(headings: Sequence[Heading | None], *, has_period: bool = F
     A column that is None has another role. With a sampling period a column ``T`` is no time.
     """
     ranks = [
-        (rank, place)
-        for place, heading in enumerate(headings)
-        if heading is not None and (rank := _rank_time(heading, place)) is not None
+        (rank, index)
+        for index, heading in enumerate(headings)
+        if heading is not None and (rank := _rank_time(heading, index)) is not None
     ]
-    rank, place = min(ranks, default=(_TEMPERATURE_RANK, None))
-    return None if has_period and rank == _TEMPERATURE_RANK else place
+    rank, index = min(ranks, default=(_TEMPERATURE_RANK, None))
+    return None if has_period and rank == _TEMPERATURE_RANK else index
 
 
-def _rank_time(heading: Heading, place: int) -> int | None:
+def _rank_time(heading: Heading, index: int) -> int | None:
     """Rank a column as the one of times, the best first; None if it cannot be."""
     name, kind, is_stamp = heading.name, heading.kind, heading.kind in STAMP_KINDS
     word = find_time_word(name)
@@ -201,7 +201,7 @@ def _rank_time(heading: Heading, place: int) -> int | None:
     if is_stamp:
         return 3 if kind == "stamp" else 4
     # The index of a table, which is its time.
-    is_index = is_nameless(heading) and kind == "number" and (place == 0 or bool(name))
+    is_index = is_nameless(heading) and kind == "number" and (index == 0 or bool(name))
     return 6 if is_index else None
 
 

@@ -345,8 +345,8 @@ def _read_mapping(
             )
         axis = _read_labelled_times(headings[time], table[labels[time]], f"the times of {owner}")
     columns = []
-    for place, (label, heading) in enumerate(zip(labels, headings, strict=True)):
-        if place == time:
+    for position, (label, heading) in enumerate(zip(labels, headings, strict=True)):
+        if position == time:
             continue
         if heading.kind == "count":
             tell_notes(

@@ -166,13 +166,13 @@ def compute_start_slopes(
     depends = _list_states(problem, MeasuredInitial)
     freed = free_start() if depends else problem.share(f"free start of {state}", free_start)
     known = dict(zip(problem.free_names, theta.tolist(), strict=True))
-    place = _join_starts(freed, known, {state: starts})
+    point = _join_starts(freed, known, {state: starts})
     is_start = np.array([name not in known for name in freed.free_names])
 
     def simulate(*steps: float) -> FloatArray:
-        places = np.repeat(place[None], len(steps), axis=0)
-        places[:, is_start] += np.array(steps)[:, None]
-        return np.asarray(weight * freed.predict(places)[:, rows])
+        points = np.repeat(point[None], len(steps), axis=0)
+        points[:, is_start] += np.array(steps)[:, None]
+        return np.asarray(weight * freed.predict(points)[:, rows])
 
     experiments = _number_experiments(problem)
     slopes = np.zeros((rows.size, len(problem.experiments)))
@@ -194,7 +194,7 @@ def compute_start_slopes(
 def _number_experiments(problem: Problem) -> IntArray:
     """Number the experiment of each scored sample, (n,)."""
     counts = [
-        sum(samples.places.size for samples in experiment.outputs)
+        sum(samples.positions.size for samples in experiment.outputs)
         for experiment in problem.experiments
     ]
     return np.repeat(np.arange(len(counts), dtype=np.int64), counts)[problem.scored_rows]
@@ -243,15 +243,15 @@ def _fit_free_starts(
     start = _join_starts(freed, known, moved_starts)
     n = _MAX_STEPS * (start.size + 1)
     (end,) = refine_candidates(freed, [start], n)
-    place = start if end is None else end.theta
-    after = float(freed.evaluate_fitness(place[None])[0])
+    point = start if end is None else end.theta
+    after = float(freed.evaluate_fitness(point[None])[0])
     # The loss may also fall because the new fit left a poor minimum.
-    by_name = dict(zip(freed.free_names, place.tolist(), strict=True))
+    by_name = dict(zip(freed.free_names, point.tolist(), strict=True))
     moved = np.array([by_name[name] for name in problem.free_names])
     ends = refine_candidates(problem, [theta, moved], n)
     before = min(candidate.rms for candidate in ends if candidate is not None)
     with np.errstate(all="ignore"):  # a start may have no effect on the output
-        return before, after, analyse_estimate(freed, place)
+        return before, after, analyse_estimate(freed, point)
 
 
 def _list_wrong_starts(

@@ -70,15 +70,15 @@ def _format_smooth(switch: FunctionCall) -> str:
 
 def _has_jumps(problem: Problem, theta: FloatArray) -> bool:
     """Whether the loss jumps on a short line through the estimate, along any parameter."""
-    place = to_unit(problem.evaluator, theta[None])[0]
+    point = to_unit(problem.evaluator, theta[None])[0]
     steps = np.linspace(-0.5 * _SPAN, 0.5 * _SPAN, _POINTS)
-    places = np.repeat(place[None], place.size * _POINTS, axis=0)
-    inside = np.clip(place, 0.5 * _SPAN, 1.0 - 0.5 * _SPAN)
-    for d in range(place.size):
-        places[d * _POINTS : (d + 1) * _POINTS, d] = inside[d] + steps
-    losses = problem.evaluate_fitness(from_unit(problem.evaluator, places)) ** 2
+    points = np.repeat(point[None], point.size * _POINTS, axis=0)
+    inside = np.clip(point, 0.5 * _SPAN, 1.0 - 0.5 * _SPAN)
+    for d in range(point.size):
+        points[d * _POINTS : (d + 1) * _POINTS, d] = inside[d] + steps
+    losses = problem.evaluate_fitness(from_unit(problem.evaluator, points)) ** 2
     with np.errstate(invalid="ignore"):
-        changes = np.diff(losses.reshape(place.size, _POINTS), axis=1)
+        changes = np.diff(losses.reshape(point.size, _POINTS), axis=1)
         bends = np.max(np.abs(np.diff(changes, axis=1)), axis=1)
     largest = np.max(np.abs(changes), axis=1)
     return bool(np.any((largest > _ROUNDING * np.min(losses)) & (bends > _JUMP_SHARE * largest)))

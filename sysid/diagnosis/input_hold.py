@@ -24,9 +24,9 @@ from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
 
-_NOTABLE_STDERRS = 1.0  # standard errors: a larger difference is told
+_NOTABLE_STDERRS = 1.0  # standard errors: a larger difference is reported
 _CLEAR_EVIDENCE = 10.0  # twice the logarithm of the ratio of likelihoods
-_MAX_TOLD = 3  # estimates in one sentence
+_MAX_NAMED = 3  # estimates in one sentence
 _MIN_ROUGH = 50  # samples: fewer may be rough by chance
 _READINGS = {"zero": "held", "first": "as straight lines", "band-limited": "band-limited"}
 
@@ -161,7 +161,7 @@ def describe_input_holds(
 ) -> list[str]:
     """Describe holds chosen by the data where the choice moves an estimate, or fits worse.
 
-    That an input is read as straight lines is told only where that is in doubt.
+    That an input is read as straight lines is reported only where that is in doubt.
     """
     messages = []
     for hold, doubt in zip(holds, doubts, strict=True):
@@ -187,9 +187,9 @@ def _describe_moved_estimates(hold: InputHold, estimates: Sequence[Estimate]) ->
             move = abs(other - estimate.value) / estimate.stderr
             if move > _NOTABLE_STDERRS:
                 unit = "" if estimate.unit == "1" else f" {estimate.unit}"
-                told = f"{estimate.name} = {other:.4g}{unit} instead of {estimate.value:.4g}"
-                moves.append((-move, told))
-    return ", ".join(told for _, told in sorted(moves)[:_MAX_TOLD])
+                text = f"{estimate.name} = {other:.4g}{unit} instead of {estimate.value:.4g}"
+                moves.append((-move, text))
+    return ", ".join(text for _, text in sorted(moves)[:_MAX_NAMED])
 
 
 def _compute_evidence(hold: InputHold, samples: int, rms: float) -> float:

@@ -284,9 +284,9 @@ def _describe_moves(
 
     An estimate without a standard error moves notably by a hundredth of its range, in a new fit.
     """
-    places = to_unit(problem.evaluator, np.array([theta, end]))
+    points = to_unit(problem.evaluator, np.array([theta, end]))
     by_name = {
-        name: (float(end[d]), float(abs(places[1, d] - places[0, d])))
+        name: (float(end[d]), float(abs(points[1, d] - points[0, d])))
         for d, name in enumerate(problem.free_names)
     }
     described = {}
@@ -350,11 +350,11 @@ def _compare_errors(
     if analysis.residuals_and_sensitivities is None:
         return {}, 0
     try:
-        found = compute_sensitivities(fine, theta, max_simulations)
+        by_half = compute_sensitivities(fine, theta, max_simulations)
     except BudgetSpentError as spent:
         return {}, spent.evaluations
     by_coarse = compute_variances(analysis.residuals_and_sensitivities[1])
-    by_fine = compute_variances(found.columns)
+    by_fine = compute_variances(by_half.columns)
     with np.errstate(all="ignore"):
         growth = dict(zip(fine.free_names, np.sqrt(by_fine / by_coarse).tolist(), strict=True))
     described = {
@@ -362,7 +362,7 @@ def _compare_errors(
         for e in analysis.estimates
         if e.stderr and growth.get(e.name, 1.0) > _NOTABLE_GROWTH
     }
-    return described, found.evaluations
+    return described, by_half.evaluations
 
 
 def _format_estimate(estimate: Estimate, other: Estimate) -> str:

@@ -259,8 +259,8 @@ def _fit_order(
         _to_theta(other, entry, process)
         for process in _list_starts(assumptions.process, entry, problem)
     ]
-    found = refine_candidates(other, starts, _MAX_SIMULATIONS // 2, is_late)
-    ends = [end for end in found if end is not None]
+    candidates = refine_candidates(other, starts, _MAX_SIMULATIONS // 2, is_late)
+    ends = [end for end in candidates if end is not None]
     if not ends or any(end.is_cut_short for end in ends):
         return None
     best = min(ends, key=lambda end: end.rms)
@@ -365,8 +365,8 @@ def _fit_coloured_noise(fitted: _FittedOrder) -> tuple[FloatArray, Whitening, in
     problem, theta, search = fitted.problem, fitted.theta, WhitenedLeastSquares(fitted.problem)
     whitening = _fit_correlation_time(problem, problem.compute_residuals(theta[None])[0])
     for _ in range(_ROUNDS):
-        place = search.find_lowest_minimum([to_unit(problem.evaluator, theta[None])[0]], whitening)
-        theta = from_unit(problem.evaluator, place[None])[0]
+        point = search.find_lowest_minimum([to_unit(problem.evaluator, theta[None])[0]], whitening)
+        theta = from_unit(problem.evaluator, point[None])[0]
         whitening = _fit_correlation_time(problem, problem.compute_residuals(theta[None])[0])
     return theta, whitening, search.evaluations + _ROUNDS
 

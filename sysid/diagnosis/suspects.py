@@ -6,9 +6,9 @@ with the linear model of the outputs, which costs no simulation. The largest gai
 
     gain = n ln(Σe²₀/Σe²) − q ln n
 
-with the sums of squares before and after, and q parameters, of which the place of a step counts as
-one (Schwarz 1978). Outliers are compared by the likelihood of Student's t, slow noise by that of
-a first-order process. Samples at a limit are left out: any value beyond it gives the same reading.
+with the sums of squares before and after, and q parameters (Schwarz 1978). The position of a step
+counts as one. Outliers are compared by the likelihood of Student's t, slow noise by that of a
+first-order process. Samples at a limit are left out: any value beyond it gives the same reading.
 So are runs of equal readings, where a reading otherwise differs from the one before.
 """
 
@@ -29,7 +29,7 @@ from sysid.uncertainty.analysis import Analysis
 
 _MIN_GAIN = 10.0
 _MIN_SAMPLES = 40
-_PLACES = 100  # of a record, between which an offset begins and ends
+_POSITIONS = 100  # of a record, between which an offset begins and ends
 _START_SHARE = 0.1  # of a record: an offset that ends so early is one of the start
 _OWN_SHARE = 1e-3  # of an offset that no parameter explains: less says nothing
 _OUTLYING = 6.0  # robust deviations
@@ -163,9 +163,9 @@ class _LinearFit:
         return Suspect(f"a drift of {where}", self._compute_gain(np.column_stack(line), 2), cure)
 
     def _fit_change(self, part: ResidualPart, where: str) -> Suspect:
-        """Fit an offset of a span, at the best of some places."""
+        """Fit an offset of a span, at the best of some positions."""
         n, start = part.times.size, part.rows.start
-        edges = np.unique(np.linspace(0, n, _PLACES + 1).astype(np.int64))
+        edges = np.unique(np.linspace(0, n, _POSITIONS + 1).astype(np.int64))
         first, last = (edges[index] for index in np.triu_indices(edges.size, 1))
         is_part = last - first < n
         first, last = first[is_part], last[is_part]
@@ -180,12 +180,12 @@ class _LinearFit:
         begin, end = float(part.times[first[best]]), float(part.times[last[best] - 1])
         gain = float(gains[best])
         cure = "Leave that span out, or record the disturbance as an input"
-        place = int(first[best] or last[best])  # of the only change; an offset covers either side
-        if ends[best] == 1 and place <= _START_SHARE * n:
+        index = int(first[best] or last[best])  # of the only change; an offset covers either side
+        if ends[best] == 1 and index <= _START_SHARE * n:
             cure = "Estimate the initial states, or leave the start out with skip"
             return Suspect(f"a wrong start of {where}", gain, cure)
         if ends[best] == 1:
-            moment = float(part.times[place])
+            moment = float(part.times[index])
             return Suspect(f"a step disturbance of {where} at about {moment:.4g} s", gain, cure)
         return Suspect(f"a disturbance of {where} from {begin:.4g} to {end:.4g} s", gain, cure)
 
@@ -221,12 +221,12 @@ class _LinearFit:
             count = int(np.count_nonzero(at_limit))
             if count < max(_MIN_LIMIT_SAMPLES, _LIMIT_SHARE * measured.size):
                 continue
-            found = self._leave_out(part, at_limit)
-            if found is None or np.mean(side * found.left_out > 0) < _ONE_SIDED:
+            fitted = self._leave_out(part, at_limit)
+            if fitted is None or np.mean(side * fitted.left_out > 0) < _ONE_SIDED:
                 continue
             yield Suspect(
                 f"a sensor at its limit: {where} is {self._format(part, limit)} in {count} samples",
-                found.gain,
+                fitted.gain,
                 "Leave these samples out: empty cells are not compared",
                 is_seen=True,
             )
@@ -240,8 +240,8 @@ class _LinearFit:
         stuck = np.repeat(lengths >= _STUCK_SAMPLES, lengths)
         if not stuck.any() or stuck.all() or np.mean(moves[~stuck]) < _MOVING:
             return
-        found = self._leave_out(part, stuck)
-        if found is None:
+        fitted = self._leave_out(part, stuck)
+        if fitted is None:
             return
         first = starts[lengths >= _STUCK_SAMPLES][0]
         value, moment = float(measured[first]), float(part.times[first])
@@ -249,7 +249,7 @@ class _LinearFit:
             f"a sensor that is stuck: {where} repeats its value in "
             f"{np.count_nonzero(stuck)} samples, such as {self._format(part, value)} from "
             f"{moment:.4g} s",
-            found.gain,
+            fitted.gain,
             "Leave these samples out: empty cells are not compared",
             is_seen=True,
         )

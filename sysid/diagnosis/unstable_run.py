@@ -7,9 +7,10 @@ only. Predictions one step ahead start again at each measured output, so they fo
 measurements whose noise is small beside the disturbances.
 
 So if residuals are not white, and an input follows them or the free run is unstable, the model is
-fitted one step ahead as well. These estimates are told if the free run is unstable there too, or if
-their residuals are white. A free run counts as unstable if the effect of some start is ten times as
-large in the last quarter of an experiment as in its first half. A double integrator reaches three.
+fitted one step ahead as well. Its estimates are reported if the free run is unstable there too,
+or if its residuals are white. A free run counts as unstable if the effect of some start is ten
+times as large in the last quarter of an experiment as in its first half. A double integrator
+reaches three.
 
 A value is `prediction-dependent` if its 95 % interval does not hold that of one step ahead. Such an
 interval is often far too narrow: disturbances grow, and so do the sensitivities.
@@ -129,10 +130,10 @@ def warn_misled_run(
     """Warn about a free run that disturbances mislead, with estimates of one step ahead."""
     if comparison is None:
         return []
-    told = _describe(comparison.estimates, {one.name: one for one in estimates})
+    described = _describe(comparison.estimates, {one.name: one for one in estimates})
     return [
         f"{comparison.cause}. So a free run attributes disturbances to the parameters. Predicted "
-        f"one step ahead they are {told}. Use {' and '.join(comparison.options)}."
+        f"one step ahead they are {described}. Use {' and '.join(comparison.options)}."
     ]
 
 

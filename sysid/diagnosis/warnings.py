@@ -83,7 +83,7 @@ def collect_warnings(
     messages += [
         text
         for estimate in analysis.estimates
-        if (text := _warn_unidentified(estimate, is_told=estimate.name in active_names))
+        if (text := _warn_unidentified(estimate, is_reported=estimate.name in active_names))
     ]
     delay_names = find_delay_parameters(problem)
     if analysis.uncertainty is not None:
@@ -206,10 +206,10 @@ def _warn_worse_than_line(channels: Sequence[ChannelMetrics]) -> list[str]:
     ]
 
 
-def _warn_unidentified(estimate: Estimate, *, is_told: bool) -> str:
+def _warn_unidentified(estimate: Estimate, *, is_reported: bool) -> str:
     """Warn about an estimate that the data do not determine.
 
-    `is_told`: another warning says at which bound it lies, and which bounds to widen.
+    `is_reported`: another warning says at which bound it lies, and which bounds to widen.
     """
     low = estimate.value < 0.5 * (estimate.lower + estimate.upper)
     side, bound = ("lower", estimate.lower) if low else ("upper", estimate.upper)
@@ -217,7 +217,7 @@ def _warn_unidentified(estimate: Estimate, *, is_told: bool) -> str:
     position = f"lies at its {side} bound {bound:g}{unit}"
     match estimate.status:
         case "at bound":
-            return "" if is_told else f"{estimate.name} {position}"
+            return "" if is_reported else f"{estimate.name} {position}"
         case "group" | "unidentifiable":
             also = f"; it {position}" if estimate.value == bound else ""
             return f"{estimate.name} is not identified: {estimate.reason}{also}"

@@ -347,10 +347,10 @@ def _write_outputs(program: GeneratedProgram) -> list[str]:
     if program.grid_step is not None:
         return _write_interpolated_outputs(program)
     model, substeps = program.identified.model, program.substeps
-    place = f"i*{substeps}" if substeps > 1 else "i"
+    position = f"i*{substeps}" if substeps > 1 else "i"
     lines = [
         "for (long i = 0; i < n; ++i) {",
-        f"    const long {program.loop_variable} = {place};",
+        f"    const long {program.loop_variable} = {position};",
         f"    (void){program.loop_variable};",
     ]
     for output in model.outputs:

@@ -70,9 +70,9 @@ class TargetLanguage(Protocol):
             return f"{array}[{index}]"
         return f"{array}[{f'({index})' if '-' in index else index}{self.whole_division}{divisor}]"
 
-    def write_signal_read(self, helper: str, signal: str, place: str) -> str:
+    def write_signal_read(self, helper: str, signal: str, position: str) -> str:
         """Write a call of a helper that reads an input."""
-        return f"{helper}({signal}, {self.length_argument}{place}{HELPER_ARGUMENTS[helper]})"
+        return f"{helper}({signal}, {self.length_argument}{position}{HELPER_ARGUMENTS[helper]})"
 
     def write_clamp(self, value: str, least: int, most: int) -> str:
         """Write a number limited to a range."""

@@ -16,7 +16,7 @@ from sysid.results.saved_result import FORMAT, read_json
 def load_identified(path: str | PathLike[str]) -> IdentifiedModel:
     """Read an identified model from the JSON file of `export_model` or ``lagid export``.
 
-    `simulate` takes it in the place of values, and its `model` and `parameter_values` are those of
+    `simulate` takes it instead of values, and its `model` and `parameter_values` are those of
     the export.
 
     Raises

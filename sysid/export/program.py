@@ -274,26 +274,26 @@ class LoopScope(ExportScope):
                 return program.language.write_element(name, index, substeps)
             if substeps == 1 and self.stage != "slope":
                 return program.language.write_element(name, self._write_position(past), 1)
-        place = self._write_sample_position(past)
+        position = self._write_sample_position(past)
         on_grid = "" if program.grid_step is None else "_on_grid"
         if held and past.name in program.mean_input_names:
             helper = f"averaged{on_grid}"
-            place += " + half" if program.is_recursion else ""
+            position += " + half" if program.is_recursion else ""
         elif held:
             helper = "held"
-            place += self._write_jump_offset(past)
+            position += self._write_jump_offset(past)
         else:
             helper = f"between{on_grid}"
         program.helper_names.add(helper)
-        return program.language.write_signal_read(helper, name, place)
+        return program.language.write_signal_read(helper, name, position)
 
     def _write_sample_position(self, past: PastValue) -> str:
-        program, place = self.program, self._write_position(past)
+        program, position = self.program, self._write_position(past)
         if program.grid_step is not None:
-            return f"({place})*ratio"
+            return f"({position})*ratio"
         if program.substeps == 1:
-            return place
-        return f"({place})/{write_number(program.substeps)}"
+            return position
+        return f"({position})/{write_number(program.substeps)}"
 
     def _write_jump_offset(self, past: PastValue) -> str:
         """Offset at a jump: a recursion reads after it, a solver from one jump to the next."""
@@ -320,7 +320,7 @@ class LoopScope(ExportScope):
         return program.language.write_choice(f"{position} < {delay}", before, value)
 
     def _write_state_position(self, name: str) -> str:
-        """Write the place in steps from which a delay of a state counts."""
+        """Write the position in steps from which a delay of a state counts."""
         if self.stage == "slope":
             return "step + part"
         is_later = self.stage == "update" and self._is_updated(name)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 Domain = tuple[float, float]
-Place = tuple[Domain, Domain]
+PlotArea = tuple[Domain, Domain]
 """Horizontal and vertical domain of a plot in the figure."""
 
 WIDE_MARGIN = {"l": 72, "r": 16, "t": 36, "b": 6}
@@ -49,7 +49,7 @@ class PlotGrid:
         """Compute the height (px) of the figure, so that a page can reserve its room."""
         return self.n_rows * int(self._row) + margin["t"] + margin["b"]
 
-    def place(self, number: int) -> Place:
+    def get_area(self, number: int) -> PlotArea:
         """Compute the horizontal and vertical domain of a plot, counted from 0."""
         row, column = divmod(number, self.n_columns)
         width = (1 - self.gap * (self.n_columns - 1)) / self.n_columns
@@ -69,7 +69,7 @@ def wide_grid(count: int, columns: int) -> PlotGrid:
 
 
 def add_axes(
-    figure: dict[str, Any], number: int, domain: Place, x: dict[str, Any], y: dict[str, Any]
+    figure: dict[str, Any], number: int, domain: PlotArea, x: dict[str, Any], y: dict[str, Any]
 ) -> dict[str, str]:
     """Add the axes of a plot, counted from 0; return the axis names for its traces."""
     suffix = "" if number == 0 else str(number + 1)
@@ -79,7 +79,7 @@ def add_axes(
     return {"xaxis": f"x{suffix}", "yaxis": f"y{suffix}"}
 
 
-def add_caption(figure: dict[str, Any], text: str, domain: Place, shift: int = 4) -> None:
+def add_caption(figure: dict[str, Any], text: str, domain: PlotArea, shift: int = 4) -> None:
     """Write a caption above a plot, `shift` px away."""
     across, upward = domain
     caption: dict[str, Any] = {

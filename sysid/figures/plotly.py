@@ -18,7 +18,7 @@ from sysid.core.text import (
 )
 from sysid.figures import theme
 from sysid.figures.data import Floats, SearchTraces
-from sysid.figures.grid import Place, PlotGrid, add_axes, add_caption
+from sysid.figures.grid import PlotArea, PlotGrid, add_axes, add_caption
 from sysid.figures.theme import stride_indices
 from sysid.models.parameters import Parameter
 from sysid.search.state import Improvement, IslandSummary
@@ -109,7 +109,7 @@ def plot_convergence(run: SearchTraces, columns: int = 3) -> Figure:
     }
     figure["layout"]["margin"] = {**MARGIN, "b": 36}
     for number, parameter in enumerate(parameters):
-        _add_parameter_plot(figure, run, number, parameter, grid.place(number))
+        _add_parameter_plot(figure, run, number, parameter, grid.get_area(number))
     return figure
 
 
@@ -310,7 +310,7 @@ def _find_final_fitness(island: IslandSummary) -> float:
 
 
 def _add_parameter_plot(
-    figure: Figure, run: SearchTraces, number: int, parameter: Parameter, domain: Place
+    figure: Figure, run: SearchTraces, number: int, parameter: Parameter, domain: PlotArea
 ) -> None:
     axis_names = add_axes(
         figure,

@@ -86,8 +86,8 @@ def plot_posterior(
         pair = shown[column], shown[row]
         figure["data"] += _draw_samples(*pair, names)
         figure["data"] += _draw_ellipse(*pair, float(matrix[chosen[column], chosen[row]]), names)
-    for place, parameter in enumerate(shown):
-        names = _add_cell(figure, shown, place, place)
+    for index, parameter in enumerate(shown):
+        names = _add_cell(figure, shown, index, index)
         figure["data"].append(_draw_histogram(parameter, names))
         figure["layout"]["shapes"] += _draw_interval(parameter, names)
     _show_legend_once(figure)
@@ -217,9 +217,9 @@ def _lay_grid(parameter: Corner) -> Floats:
     return np.linspace(max(low, lower), min(high, upper), _CELLS)
 
 
-def _compute_kernels(parameter: Corner, places: Floats) -> Floats:
-    """Compute the kernels (P, n) of all samples at places (P,)."""
-    distances = (places[:, None] - parameter.samples) / _find_bandwidth(parameter.samples)
+def _compute_kernels(parameter: Corner, points: Floats) -> Floats:
+    """Compute the kernels (P, n) of all samples at points (P,)."""
+    distances = (points[:, None] - parameter.samples) / _find_bandwidth(parameter.samples)
     return np.asarray(np.exp(-0.5 * distances**2))
 
 

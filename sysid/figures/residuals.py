@@ -7,7 +7,7 @@ import numpy as np
 
 from sysid.figures import theme
 from sysid.figures.data import CorrelationTrace, Floats
-from sysid.figures.grid import Place, PlotGrid, add_axes, add_caption
+from sysid.figures.grid import PlotArea, PlotGrid, add_axes, add_caption
 from sysid.figures.plotly import MARGIN, Figure, base_layout, to_json_numbers
 
 _MARGIN = {**MARGIN, "t": 34, "b": 6}
@@ -34,7 +34,7 @@ def plot_residuals(
         ),
     }
     for number, function in enumerate(functions):
-        _add_correlation(figure, number, function, grid.place(number))
+        _add_correlation(figure, number, function, grid.get_area(number))
     return figure
 
 
@@ -48,7 +48,7 @@ def residuals_height(n_functions: int, columns: int = 2) -> int:
 
 
 def _add_correlation(
-    figure: Figure, number: int, correlation: CorrelationTrace, domain: Place
+    figure: Figure, number: int, correlation: CorrelationTrace, domain: PlotArea
 ) -> None:
     shown = (
         correlation.lags != 0 if correlation.is_auto else np.ones(correlation.lags.size, dtype=bool)

@@ -62,20 +62,20 @@ def plot_comparison(
     Parameters
     ----------
     compared : sequence of (name, experiment)
-        Results of one experiment each. Outputs of the same place and unit share a plot, and so do
-        inputs.
+        Results of one experiment each. Outputs of the same position and unit share a plot, and so
+        do inputs.
     start, stop : float, optional
         Draw only this range (s).
     """
     aligned = _align_starts(compared)
     outputs = _group_plots(
-        (one.measured, _Compared(place, name, number, one))
-        for place, (name, experiment) in enumerate(aligned)
+        (one.measured, _Compared(index, name, number, one))
+        for index, (name, experiment) in enumerate(aligned)
         for number, one in enumerate(experiment.outputs)
     )
     inputs = _group_plots(
-        (one, _Compared(place, name, number, one))
-        for place, (name, experiment) in enumerate(aligned)
+        (one, _Compared(index, name, number, one))
+        for index, (name, experiment) in enumerate(aligned)
         for number, one in enumerate(experiment.inputs)
     )
     figure = stack_plots(_response_heights(len(outputs), len(inputs)))
@@ -98,9 +98,9 @@ def plot_comparison(
 
 @dataclass(frozen=True, slots=True)
 class _Compared(Generic[T]):
-    """A signal of one of the compared results: its place among them, name, and number."""
+    """A signal of one of the compared results: its index among them, name, and number."""
 
-    place: int
+    index: int
     name: str
     number: int
     signal: T
@@ -179,7 +179,7 @@ def _compare_outputs(
         measured = _output_traces(sharing[0].signal, span, upper, is_new)[0]
         yield measured if len(plot) == 1 else _name_measured(measured, signal, sharing)
         for one in sharing:
-            look = {"legendgroup": one.name, "line": theme.series_style(one.place)}
+            look = {"legendgroup": one.name, "line": theme.series_style(one.index)}
             hover = f"%{{y:.6~g}}{plain_unit(signal.unit)}<extra>{one.name}</extra>"
             # The legend names each result once, wherever its first output is drawn.
             identified = _output_traces(one.signal, span, upper, one.number == 0)[-1]
@@ -197,7 +197,7 @@ def _name_measured(
 ) -> dict[str, Any]:
     """Name a measured signal by the first of its results, and give it a shade of its colour."""
     first, name = sharing[0], f"measured, {sharing[0].name}"
-    shade = theme.fade(theme.series_style(first.place)["color"], 0.45)
+    shade = theme.fade(theme.series_style(first.index)["color"], 0.45)
     kind = "marker" if trace["mode"] == "markers" else "line"
     hover = f"%{{y:.6~g}}{plain_unit(signal.unit)}<extra>{name}</extra>"
     return {
@@ -214,7 +214,7 @@ def _compare_inputs(
 ) -> Iterator[dict[str, Any]]:
     for signal, sharing in plot:
         span, first = window_slice(signal.times, *window), sharing[0]
-        colour = theme.GREY if len(plot) == 1 else theme.series_style(first.place)["color"]
+        colour = theme.GREY if len(plot) == 1 else theme.series_style(first.index)["color"]
         line = signal_line(signal, span, axis, colour, legend=False)
         if len(plot) > 1:
             line |= {"name": f"{signal.name}, {first.name}", "legendgroup": first.name}

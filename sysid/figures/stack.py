@@ -43,7 +43,7 @@ def _find_sides(figures: Iterable[Figure]) -> dict[str, int]:
 
 
 class _Part:
-    """One figure of a stack: its place, and the numbers of its axes in the whole.
+    """One figure of a stack: its position, and the numbers of its axes in the whole.
 
     The whole has no margin at top and bottom, so that every part keeps its own.
     """
@@ -121,8 +121,8 @@ class _Part:
         if "legendgroup" in trace:
             moved["legendgroup"] = f"{trace['legendgroup']} {self._number}"
         if "colorbar" in trace:
-            place = {"y": self._upward(0.5), "len": self._top - self._bottom}
-            moved["colorbar"] = {**trace["colorbar"], **place}
+            position = {"y": self._upward(0.5), "len": self._top - self._bottom}
+            moved["colorbar"] = {**trace["colorbar"], **position}
         return moved
 
     def _move_axis(self, axis: Mapping[str, Any], kind: str) -> dict[str, Any]:

@@ -50,7 +50,7 @@ class ActiveBound(NamedTuple):
         return f"{text}, to {self.limit:.4g}{format_unit(self.unit)} at the {most}"
 
 
-def is_active(influence: FloatArray, columns: FloatArray, place: FloatArray) -> BoolArray:
+def is_active(influence: FloatArray, columns: FloatArray, point: FloatArray) -> BoolArray:
     """Return which parameters (D,) the data pull beyond their bounds, each considered alone.
 
     Parameters
@@ -58,14 +58,14 @@ def is_active(influence: FloatArray, columns: FloatArray, place: FloatArray) -> 
     influence : FloatArray, shape (n,)
         Influence of the weighted residuals (model minus data) on the loss.
     columns : FloatArray, shape (n, D)
-        Sensitivities of the outputs to the places.
-    place : FloatArray, shape (D,)
+        Sensitivities of the outputs to the point.
+    point : FloatArray, shape (D,)
         In [0, 1].
     """
-    low, high = is_at_bounds(place)
+    low, high = is_at_bounds(point)
     total = float(influence @ influence)
     if total == 0.0 or not np.any(low | high):
-        return np.zeros(place.size, dtype=np.bool_)
+        return np.zeros(point.size, dtype=np.bool_)
     downhill = -(columns.T @ influence)
     size = np.einsum("nd,nd->d", columns, columns)
     share = downhill**2 / np.where(size > 0, size * total, np.inf)
@@ -78,7 +78,7 @@ def rank_active_bounds(
     limits: tuple[Interval, ...],
     influence: FloatArray,
     columns: FloatArray,
-    place: FloatArray,
+    point: FloatArray,
 ) -> tuple[ActiveBound, ...]:
     """Rank the bounds to widen together, the costliest first; arrays as in `is_active`.
 
@@ -89,9 +89,9 @@ def rank_active_bounds(
     limits : tuple of (float, float)
         Lowest and highest value that the bounds of each may have.
     """
-    step = _LinearStep.from_place(space, limits, influence, columns, place)
-    low, high = is_at_bounds(place)
-    room = np.where(low, -step.outer_moves[0] - place, step.outer_moves[1] - (1.0 - place))
+    step = _LinearStep.from_point(space, limits, influence, columns, point)
+    low, high = is_at_bounds(point)
+    room = np.where(low, -step.outer_moves[0] - point, step.outer_moves[1] - (1.0 - point))
     candidates = [int(d) for d in np.flatnonzero((low | high) & (room > _MIN_ROOM))]
     shares: dict[int, float] = {}
     loss, total = step.solve_released(())[1], float(influence @ influence)
@@ -103,7 +103,7 @@ def rank_active_bounds(
         if not (share > _MIN_SHARE and share * influence.size > _MIN_SIGNIFICANCE):
             break
         shares[best], loss = share, reached
-    moved = place + step.solve_released(tuple(shares))[0]
+    moved = point + step.solve_released(tuple(shares))[0]
     active = [
         _make_active_bound(space[d], limits[d], bool(low[d]), share)
         for d, share in shares.items()
@@ -134,15 +134,15 @@ class _LinearStep(NamedTuple):
     outer_moves: FloatArray
 
     @classmethod
-    def from_place(
+    def from_point(
         cls,
         space: tuple[Parameter, ...],
         limits: tuple[Interval, ...],
         influence: FloatArray,
         columns: FloatArray,
-        place: FloatArray,
+        point: FloatArray,
     ) -> "_LinearStep":
-        """Set up the step from a place (D,)."""
+        """Set up the step from a point (D,)."""
         basis, root = np.linalg.qr(columns)
         target = -(basis.T @ influence)
         rest = float(influence @ influence - target @ target)
@@ -150,7 +150,7 @@ class _LinearStep(NamedTuple):
             [_to_unit_value(parameter, end) for end in interval]
             for parameter, interval in zip(space, limits, strict=True)
         ]
-        return cls(root, target, rest, np.array([-place, 1.0 - place]), np.array(ends).T - place)
+        return cls(root, target, rest, np.array([-point, 1.0 - point]), np.array(ends).T - point)
 
     def solve_released(self, released: tuple[int, ...]) -> tuple[FloatArray, float]:
         """Compute the best move (D,) with some bounds released, and the remaining squared error."""

@@ -66,7 +66,7 @@ class ParameterBlock:
     ----------
     members : IntArray, shape (M,)
     basis : FloatArray, shape (m, M)
-        The directions, in the members' places in [0, 1].
+        The directions, in the members' coordinates in [0, 1].
     """
 
     members: IntArray
@@ -112,7 +112,7 @@ def express_combinations(
     ----------
     names : sequence of str, length D
     theta, scale : FloatArray, shape (D,)
-        Estimate, and ∂θ/∂p for the places p.
+        Estimate, and ∂θ/∂p at the point p in [0, 1].
     covariance : FloatArray, shape (D, D)
         Covariance of θ in its units, without the part along the directions.
     """
@@ -120,9 +120,9 @@ def express_combinations(
         return ()
     value, unit = theta[block.members], scale[block.members]
     has_logarithm = bool(np.all(value != 0.0))
-    per_place = unit / value if has_logarithm else np.ones(value.size)
-    entries = np.array(list(_iterate_orthogonal(block.basis * per_place)))
-    small = _find_negligible(entries * per_place)
+    per_point = unit / value if has_logarithm else np.ones(value.size)
+    entries = np.array(list(_iterate_orthogonal(block.basis * per_point)))
+    small = _find_negligible(entries * per_point)
     powers = _round_powers(entries, value, small) if has_logarithm else None
     sums = np.where(small, 0.0, entries / (value if has_logarithm else unit))
     sums = sums / _get_leading(sums)
@@ -286,7 +286,7 @@ _VAGUE_DEVIATION = 0.5  # of the range: a larger standard error is vague
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SingularDirections:
-    """Singular directions (D, D) of the sensitivities, in the places.
+    """Singular directions (D, D) of the sensitivities to the point in [0, 1].
 
     The output does not change along the `null` directions. The data say little about the `weak`
     ones. `is_null_member` marks the parameters that null directions move. `is_vague` marks those
@@ -308,7 +308,7 @@ def classify_directions(
     covariance: FloatArray,
     noise: float,
 ) -> SingularDirections:
-    """Classify the singular directions (D, D) by a covariance (D, D) of the places.
+    """Classify the singular directions (D, D) by a covariance (D, D) of the point.
 
     Parameters
     ----------

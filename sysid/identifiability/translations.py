@@ -35,9 +35,9 @@ def find_translations(
     theta : FloatArray, shape (D,)
         The estimate.
     decomposition : TruncatedSvd
-        Of the sensitivities (n, D) to the places in [0, 1].
+        Of the sensitivities (n, D) to the point in [0, 1].
     scale : FloatArray, shape (D,)
-        ∂θ/∂p for the places p.
+        ∂θ/∂p at the point p.
     most : int or None
         Limit on the simulations; directions beyond are not tested.
 

@@ -45,7 +45,7 @@ from sysid.minima.minima import (
     collect_minima,
     continue_from_archive,
     find_nearest,
-    is_same_place,
+    is_same_point,
     scan_by_projection,
     scan_parameters,
 )
@@ -213,10 +213,10 @@ class _EstimateSearch:
         ]
         if refines:
             most = budget.count_left(self._reserved)
-            found = refine_candidates(problem, champions, most, deadline.is_past_grace)
+            candidates = refine_candidates(problem, champions, most, deadline.is_past_grace)
             self.ends = [
                 self._continue_end(end, candidate)
-                for end, candidate in zip(self.ends, found, strict=True)
+                for end, candidate in zip(self.ends, candidates, strict=True)
             ]
 
     @property
@@ -257,13 +257,13 @@ class _EstimateSearch:
         self.problem = fit.problem
         self._budget.spend(fit.evaluations)
         self._move_best(IslandEnd(fit.theta, fit.rms, True), fit.evaluations)
-        places = [end.theta for end in self.ends]
-        values = self.problem.evaluate_fitness(np.array(places))
+        points = [end.theta for end in self.ends]
+        values = self.problem.evaluate_fitness(np.array(points))
         most = self._budget.count_left(self._reserved)
-        found = refine_candidates(self.problem, places, most, is_late)
+        candidates = refine_candidates(self.problem, points, most, is_late)
         self.ends = [
             self._continue_end(replace(end, rms=rms), candidate)
-            for end, rms, candidate in zip(self.ends, values.tolist(), found, strict=True)
+            for end, rms, candidate in zip(self.ends, values.tolist(), candidates, strict=True)
         ]
         self._choose_best()
 
@@ -296,18 +296,18 @@ class _EstimateSearch:
         self._budget.spend(spent)
         if not np.isfinite(values).any():
             return "with half the step no simulation is finite"
-        found = refine_candidates(
+        candidates = refine_candidates(
             half.problem, starts, max(0, most - spent), self._deadline.is_past_grace
         )
         each = spent // len(starts)
         self.ends = [
             self._continue_end(IslandEnd(start, rms, evaluations=end.evaluations + each), candidate)
             for start, rms, end, candidate in zip(
-                starts, values.tolist(), self.ends, found, strict=True
+                starts, values.tolist(), self.ends, candidates, strict=True
             )
         ]
         self.problem = half.problem
-        fitted = sum(0 if candidate is None else candidate.evaluations for candidate in found)
+        fitted = sum(0 if candidate is None else candidate.evaluations for candidate in candidates)
         self._work -= self.problem.n_steps * (fitted + spent)
         return ""
 
@@ -417,13 +417,17 @@ class _EstimateSearch:
         """Whether no search may begin: the paper's methods have none."""
         return not self._refines or self._deadline.is_past_grace()
 
-    def _continue_end(self, end: IslandEnd, found: RefinedCandidate | None) -> IslandEnd:
+    def _continue_end(self, end: IslandEnd, candidate: RefinedCandidate | None) -> IslandEnd:
         """Continue from an end to what least squares found from there, if anything."""
-        if found is None:
+        if candidate is None:
             return end
-        self._budget.spend(found.evaluations)
+        self._budget.spend(candidate.evaluations)
         return IslandEnd(
-            found.theta, found.rms, True, end.evaluations + found.evaluations, found.is_cut_short
+            candidate.theta,
+            candidate.rms,
+            True,
+            end.evaluations + candidate.evaluations,
+            candidate.is_cut_short,
         )
 
     def _find_minima(self) -> list[Fit]:
@@ -433,12 +437,12 @@ class _EstimateSearch:
         """
         end = self.ends[self._best]
         ends = [Fit(one.theta, one.rms) for one in self.ends if one.is_refined or one is end]
-        if self._scanned is None or not is_same_place(self.problem, self._scanned, end.theta):
-            found, spent = self._scan_from(end, ends)
+        if self._scanned is None or not is_same_point(self.problem, self._scanned, end.theta):
+            fits, spent = self._scan_from(end, ends)
         else:
-            found, spent = self._repeat_fits(ends, self._count_scan_simulations())
+            fits, spent = self._repeat_fits(ends, self._count_scan_simulations())
         self._budget.spend(spent)
-        fits = [*ends, *found]
+        fits = [*ends, *fits]
         best = min(fits, key=lambda fit: fit.rms)
         reached = end if best.rms >= end.rms else IslandEnd(best.theta, best.rms, True)
         self._move_best(reached, spent)
@@ -451,19 +455,19 @@ class _EstimateSearch:
         most, delays = self._count_scan_simulations(), self._list_delays()
         is_doubtful = bool(delays) and self._is_doubtful(end)
         scanned = scan_parameters(problem, start, delays, most, is_late, is_doubtful=is_doubtful)
-        found, spent = [Fit(one.theta, one.rms) for one in scanned.ends[1:]], scanned.evaluations
+        fits, spent = [Fit(one.theta, one.rms) for one in scanned.ends[1:]], scanned.evaluations
         archived = [one for island in self._state.islands for one in read_archive(island.archive)]
-        known = [*ends, *found]
+        known = [*ends, *fits]
         continued, count = continue_from_archive(problem, archived, known, most - spent, is_late)
-        found, spent = found + continued, spent + count
+        fits, spent = fits + continued, spent + count
         if is_doubtful:
             most = count_affordable_simulations(problem, self._deadline.is_over(), _MOST_PROJECTED)
             most = self._budget.cap(most, spent, _SCAN_SHARES)
             projected = scan_by_projection(problem, start, self._state.seed, most, is_late)
-            found += [Fit(one.theta, one.rms, 1, 1) for one in projected.ends[1:]]
+            fits += [Fit(one.theta, one.rms, 1, 1) for one in projected.ends[1:]]
             spent += projected.evaluations
             self._projected = projected.starts
-        return found, spent
+        return fits, spent
 
     def _is_doubtful(self, end: IslandEnd) -> bool:
         """Whether the search may have missed the best minimum, a time lag's above all."""
@@ -477,10 +481,10 @@ class _EstimateSearch:
 
     def _repeat_fits(self, ends: list[Fit], most: int) -> tuple[list[Fit], int]:
         """Fit the minima of a longer integration step again, unless they are among the ends."""
-        moved, found, spent = [(end.theta, end) for end in ends], [], 0
+        moved, fits, spent = [(end.theta, end) for end in ends], [], 0
         for fit in self._fits:
             near = next(
-                (new for old, new in moved if is_same_place(self.problem, old, fit.theta)), None
+                (new for old, new in moved if is_same_point(self.problem, old, fit.theta)), None
             )
             if near is None:
                 late = self._deadline.is_past_grace
@@ -490,8 +494,8 @@ class _EstimateSearch:
                 spent += end.evaluations
                 near = Fit(end.theta, end.rms)
                 moved.append((fit.theta, near))
-            found.append(replace(near, count=fit.count, independent=fit.independent))
-        return found, spent
+            fits.append(replace(near, count=fit.count, independent=fit.independent))
+        return fits, spent
 
     def _search_local_minima(self) -> None:
         """Search the minima near the estimate; move to the best, with intervals that cover all."""

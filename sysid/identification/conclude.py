@@ -119,7 +119,7 @@ def _build_identification(
 ) -> Identification:
     budget = Budget(algorithm.stop.evaluations, state.evaluations)
     best = find_best_estimate(problem, algorithm, state, budget, deadline, validation)
-    asked, noise, found, analysis = problem, best.noise, best.minima, best.analysis
+    asked, noise, minima, analysis = problem, best.noise, best.minima, best.analysis
     problem, theta = resolve_noise_model(best.problem, noise), noise.theta
     if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():
         raise NothingIdentifiable(problem.free_names)
@@ -137,8 +137,8 @@ def _build_identification(
         else run_residual_tests(problem, simulated, "estimation", times)
     )
     limit = algorithm.safe_limit
-    evidence = assess_search(problem, state, metrics.rms, tests, found)
-    settled = mark_unsettled(mark_ambiguous(problem, analysis.estimates, found), evidence)
+    evidence = assess_search(problem, state, metrics.rms, tests, minima)
+    settled = mark_unsettled(mark_ambiguous(problem, analysis.estimates, minima), evidence)
     analysis = replace(analysis, estimates=mark_refuted(settled, validated))
     holds = list_input_holds(problem)
     if is_refining(algorithm, len(best.ends)):
@@ -156,7 +156,7 @@ def _build_identification(
     analysis = replace(analysis, estimates=hold_marked)
     posterior = None
     if has_posterior:
-        others = [minimum.values for minimum in found.minima if minimum.is_compatible]
+        others = [minimum.values for minimum in minima.minima if minimum.is_compatible]
         left, late = budget.count_left(), deadline.is_past_grace
         posterior = sample_posterior(problem, theta, analysis, others, state.seed, left, late)
         budget.spend(posterior.evaluations)
@@ -239,7 +239,7 @@ def _build_identification(
                 analysis,
                 metrics,
                 tests,
-                is_contradicted=found.is_contradicted,
+                is_contradicted=minima.is_contradicted,
             ),
             *describe_unequal_noise(problem, metrics.channels),
             *warn_unsettled(evidence),

@@ -16,7 +16,7 @@ from sysid.simulation.problem import Problem
 
 
 def collect_fitted_data(
-    model: Model, records: FitRecords, problems: ProblemPair, found: FullResult
+    model: Model, records: FitRecords, problems: ProblemPair, result: FullResult
 ) -> FittedData:
     """Collect model and records of a result, and correlate its residuals with both sides' lags."""
     problem, validation_problem = problems
@@ -25,14 +25,16 @@ def collect_fitted_data(
         for record, run in zip(records.validation or (), records.validation_runs or (), strict=True)
     )
     tested, simulated = (
-        (problem, found.simulated)
+        (problem, result.simulated)
         if validation_problem is None
-        else (validation_problem, found.simulated_validation)
+        else (validation_problem, result.simulated_validation)
     )
     counts = {}
     if problem.prediction == "one-step" and validation_problem is None:
         counts = count_past_output_coefficients(problem.model, problem.all_parameters)
-    series = list_residual_series(tested, _join_outputs(tested, simulated), found.correlation_times)
+    series = list_residual_series(
+        tested, _join_outputs(tested, simulated), result.correlation_times
+    )
     correlations = compute_correlations(
         [one._replace(coefficients=counts.get(one.output, 0)) for one in series]
     )
@@ -66,8 +68,8 @@ def _select_signals(model: Model, record: Record) -> Record:
 def _join_outputs(problem: Problem, simulated: Sequence[Sequence[FloatArray]]) -> FloatArray:
     """Join simulated outputs to values (M,) of a problem; parts that are not scored are missing."""
     values = np.full(problem.evaluator.measured.size, np.nan)
-    places = problem.split_by_output(np.arange(values.size, dtype=np.float64))
-    for rows, outputs in zip(places, simulated, strict=True):
+    indices = problem.split_by_output(np.arange(values.size, dtype=np.float64))
+    for rows, outputs in zip(indices, simulated, strict=True):
         for row, part in zip(rows.values(), outputs, strict=True):
             values[row[row.size - part.size :].astype(np.int64)] = part
     return values

@@ -122,7 +122,7 @@ def identify(request: IdentificationRequest) -> Identification:
     read = _read_data(model, request, request.records)
     loss = request.loss or Loss()
     changes = read_changes(request.parameters)
-    found = identify_records(
+    result = identify_records(
         model,
         read.records,
         request.settings or GeneticAlgorithm(),
@@ -135,10 +135,10 @@ def identify(request: IdentificationRequest) -> Identification:
         ),
         progress=request.progress,
     )
-    assert found.data is not None
-    notes = (rewrite_settings(note, write_setting) for note in found.warnings)
-    data = replace(found.data, channels=read.channels)
-    return replace(found, warnings=(*read.notes, *notes), data=data)
+    assert result.data is not None
+    notes = (rewrite_settings(note, write_setting) for note in result.warnings)
+    data = replace(result.data, channels=read.channels)
+    return replace(result, warnings=(*read.notes, *notes), data=data)
 
 
 def _read_data(
@@ -180,7 +180,7 @@ def identify_records(
         state = advance_run(problem, algorithm, state, _PROGRESS_SECONDS)
         if progress is not None:
             progress(state)
-    found = conclude_run(
+    result = conclude_run(
         problem,
         algorithm,
         state,
@@ -188,4 +188,4 @@ def identify_records(
         posterior=options.posterior,
         orders=options.compare_orders,
     )
-    return replace(found, data=collect_fitted_data(model, prepared, problems, found))
+    return replace(result, data=collect_fitted_data(model, prepared, problems, result))

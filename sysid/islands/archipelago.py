@@ -9,7 +9,7 @@ from sysid.core.errors import InvalidSettings
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.search.archive import make_archive
-from sysid.search.evolution import draw_initial_places
+from sysid.search.evolution import draw_initial_points
 from sysid.search.island import (
     Island,
     _compute_island_budget,
@@ -106,12 +106,12 @@ def create_islands(
     plans = make_shared_plans(algorithm, n, problem.loss_scale)
     ends = np.cumsum(split_population(algorithm))
     sizes, methods = np.diff(ends, prepend=0), np.array([plan.method for plan in plans])
-    places = draw_initial_places(seed, algorithm.population, methods, sizes, n)
+    individuals = draw_initial_points(seed, algorithm.population, methods, sizes, n)
     search, points = np.zeros(len(plans), SEARCH_RECORD), np.zeros((len(plans), n))
     search["evaluations"][0] = spent
     islands = []
     for i, (plan, size, end) in enumerate(zip(plans, sizes.tolist(), ends.tolist(), strict=True)):
-        own = places[end - size : end]
+        own = individuals[end - size : end]
         improves = plan.method in (METHOD_IMPROVED, METHOD_IMPROVED_FIXED_SEQUENCE)
         island_starts = starts[i % max(len(starts), 1) :: len(plans)] if improves else ()
         values = (*warm, *island_starts)
@@ -137,7 +137,7 @@ def _place_warm_start(
     island: int,
     values: Mapping[str, float],
     p: int,
-    places: FloatArray,
+    individuals: FloatArray,
     seed: int | None,
 ) -> None:
     """Replace individual `p` by start values, or with a seed by a neighbour of them."""
@@ -151,4 +151,4 @@ def _place_warm_start(
             if seed is not None:
                 word = draw_words(seed, USE_WARM_START, island, p, d)
                 shift = _WARM_SPREAD * (2.0 * to_uniform(word[0]) - 1.0)
-            places[p, d] = min(max(start[d] + shift, 0.0), 1.0)
+            individuals[p, d] = min(max(start[d] + shift, 0.0), 1.0)

@@ -5,8 +5,9 @@ The cubic through them is the natural continuous extension of the method (Zennar
 accurate as the steps. Both slopes are those inside the step, so an input that jumps between two
 steps bends no cubic.
 
-The delay is constant in time. So each lane needs one place of every cubic, and a second one for the
-middle stages. These values are computed at the end of the step and stored. A read loads them.
+The delay is constant in time. So each lane needs one position of every cubic, and a second one
+for the middle stages. These values are computed at the end of the step and stored. A read loads
+them.
 """
 
 from sysid.kernels.delayed_reads import TimeStep
@@ -47,8 +48,8 @@ class CubicReader:
         back = b.select(self._within, unit, whole) if self._forward else whole
         stride = lanes.splat(lanes.make_integer(lanes.width * self._history.columns))
         columns = lanes.splat(lanes.make_integer(self._history.columns))
-        places = b.sub(b.mul(lanes.make_lane_numbers(), columns), b.mul(back, stride))
-        self._addresses = lanes.compute_addresses(self._history.base, places)
+        offsets = b.sub(b.mul(lanes.make_lane_numbers(), columns), b.mul(back, stride))
+        self._addresses = lanes.compute_addresses(self._history.base, offsets)
 
     def _compute_weights(self, fraction: IrValue) -> tuple[IrValue, IrValue, IrValue]:
         """Compute the weights of the older value and of both slopes, `fraction` before the end."""
@@ -103,7 +104,7 @@ class CubicReader:
                 loop.update(carried, value)
 
     def _interpolate_finished_step(self) -> list[IrValue]:
-        """Interpolate the last finished step at both places."""
+        """Interpolate the last finished step at both positions."""
         lanes, newest = self._lanes, self._states.now[self._name]
         start, first_rise, last_rise = self._states.get_finished_step(self._name)
         values = []

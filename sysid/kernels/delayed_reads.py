@@ -40,7 +40,7 @@ class DelayedReader(Protocol):
         """Read the values that the step needs."""
 
     def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
-        """Value at `halves` half steps; a state is `now` at 0 and `stage` at that place."""
+        """Value at `halves` half steps; a state is `now` at 0 and `stage` at that position."""
 
     def end_step(self, loop: KernelLoop, following: IrValue) -> None:
         """Update the carried values; `following` is the state's next value."""
@@ -57,8 +57,9 @@ def interpolate_inside_step(
 class LinearReader:
     """Linear interpolation of a state between two samples, with one gather in a step.
 
-    `places` is a chain of whole steps (see `reads.group_places`). If it reaches into the present
-    step, half steps can be read too. Their two neighbours are among the three loaded samples.
+    `positions` is a chain of whole steps (see `reads.group_positions`). If it reaches into the
+    present step, half steps can be read too. Their two neighbours are among the three loaded
+    samples.
     """
 
     def __init__(
@@ -66,13 +67,13 @@ class LinearReader:
         lanes: VectorBuilder,
         history: StateHistory,
         delay: IrValue,
-        places: list[int],
+        positions: list[int],
         row: IrValue,
     ) -> None:
         self._lanes, self._delay = lanes, delay
-        self._forward = places[0] > 0
-        self._top = min(places[0], 0) // 2
-        self._length = self._top - places[-1] // 2
+        self._forward = positions[0] > 0
+        self._top = min(positions[0], 0) // 2
+        self._length = self._top - positions[-1] // 2
         whole, self._fraction = lanes.split_fraction(delay)
         b = lanes.builder
         lane_count, lane_numbers = (
@@ -167,11 +168,11 @@ class DirectReader:
         lanes: VectorBuilder,
         history: StateHistory,
         delay: IrValue,
-        places: set[int],
+        positions: set[int],
         cubic: bool,
     ) -> None:
         self._lanes, self._history, self._delay = lanes, history, delay
-        self._places, self._cubic = sorted(places), cubic
+        self._positions, self._cubic = sorted(positions), cubic
 
     def open_loop(self, loop: KernelLoop) -> None:
         """Create the values that are carried from step to step."""
@@ -179,7 +180,7 @@ class DirectReader:
     def begin_step(self, time_step: TimeStep) -> None:
         """Read the values that the step needs."""
         self._time_step = time_step
-        self._finished = {halves: self._interpolate(halves) for halves in self._places}
+        self._finished = {halves: self._interpolate(halves) for halves in self._positions}
 
     def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
         """Value at `halves` half steps."""
@@ -194,8 +195,8 @@ class DirectReader:
 
     def _interpolate(self, halves: int) -> IrValue:
         lanes = self._lanes
-        place = lanes.sub(lanes.make_number(halves / 2), self._delay)
-        whole, fraction = lanes.split_fraction(place)
+        position = lanes.sub(lanes.make_number(halves / 2), self._delay)
+        whole, fraction = lanes.split_fraction(position)
         if not self._cubic:
             return lanes.interpolate(
                 self._load_sample(whole, 0), fraction, self._load_sample(whole, 1)
@@ -210,10 +211,10 @@ class DirectReader:
         """Load the sample `whole` + `steps` after the last finished one, at most that one."""
         lanes, b = self._lanes, self._lanes.builder
         zero = lanes.splat(lanes.make_integer(0))
-        place = b.add(whole, lanes.splat(lanes.make_integer(steps)))
-        place = b.select(b.icmp_signed("<", place, zero), place, zero)
+        position = b.add(whole, lanes.splat(lanes.make_integer(steps)))
+        position = b.select(b.icmp_signed("<", position, zero), position, zero)
         index = b.add(
-            lanes.make_lane_numbers(), b.mul(place, lanes.splat(lanes.make_integer(lanes.width)))
+            lanes.make_lane_numbers(), b.mul(position, lanes.splat(lanes.make_integer(lanes.width)))
         )
         addresses = lanes.compute_addresses(self._history.base, index)
         return lanes.gather(addresses, b.mul(self._time_step.row, lanes.make_integer(lanes.width)))
@@ -240,7 +241,7 @@ def _interpolate_lagrange(
 class InputReader:
     """Linear interpolation of a delayed input between the points of its fine grid.
 
-    `places` is a chain of whole or of half steps. The first is read; the others are its earlier
+    `positions` is a chain of whole or of half steps. The first is read; the others are its earlier
     values.
     """
 
@@ -251,25 +252,27 @@ class InputReader:
         zero: IrValue,
         points: IrValue,
         delay: IrValue,
-        places: list[int],
+        positions: list[int],
     ) -> None:
         b = lanes.builder
-        self._lanes, self._floats, self._points, self._places = lanes, floats, points, places
+        self._lanes, self._floats, self._points, self._positions = lanes, floats, points, positions
         whole, self._fraction = lanes.split_fraction(delay)
         self._addresses = lanes.compute_addresses(floats, b.sub(lanes.splat(zero), whole))
-        self._initial = [self._load_value(lanes.make_integer(0), halves) for halves in places[1:]]
+        self._initial = [
+            self._load_value(lanes.make_integer(0), halves) for halves in positions[1:]
+        ]
 
     def _load_value(self, step: IrValue, halves: int) -> IrValue:
         lanes, b = self._lanes, self._lanes.builder
-        place = b.mul(b.add(b.add(step, step), lanes.make_integer(halves)), self._points)
-        place = b.ashr(place, lanes.make_integer(1))
-        newest = lanes.gather(self._addresses, place)
-        older = lanes.gather(self._addresses, b.sub(place, lanes.make_integer(1)))
+        position = b.mul(b.add(b.add(step, step), lanes.make_integer(halves)), self._points)
+        position = b.ashr(position, lanes.make_integer(1))
+        newest = lanes.gather(self._addresses, position)
+        older = lanes.gather(self._addresses, b.sub(position, lanes.make_integer(1)))
         return lanes.interpolate(newest, self._fraction, older)
 
     def load_once(self, step: IrValue) -> IrValue:
-        """Load the value at the only place, for a delay that holds there alone."""
-        return self._load_value(step, self._places[0])
+        """Load the value at the only position, for a delay that holds there alone."""
+        return self._load_value(step, self._positions[0])
 
     def open_loop(self, loop: KernelLoop) -> None:
         """Create the values that are carried from step to step."""
@@ -277,11 +280,11 @@ class InputReader:
 
     def begin_step(self, time_step: TimeStep) -> None:
         """Read the values that the step needs."""
-        self._values = [self._load_value(time_step.index, self._places[0]), *self._chain]
+        self._values = [self._load_value(time_step.index, self._positions[0]), *self._chain]
 
     def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
         """Value at `halves` half steps."""
-        return self._values[self._places.index(halves)]
+        return self._values[self._positions.index(halves)]
 
     def end_step(self, loop: KernelLoop, following: IrValue) -> None:
         """Update the carried values."""

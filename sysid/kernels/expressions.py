@@ -101,9 +101,9 @@ def _emit_call(lanes: VectorBuilder, call: FunctionCall, scope: Environment) -> 
     function = call.function
     if function in TABLE_FUNCTIONS:
         table = split_table(call)
-        place = emit_expression(lanes, table.argument, scope)
+        position = emit_expression(lanes, table.argument, scope)
         values = [emit_expression(lanes, value, scope) for value in table.y]
-        return emit_table(lanes, place, table.x, values, is_cubic=function == "pchip")
+        return emit_table(lanes, position, table.x, values, is_cubic=function == "pchip")
     arguments = [emit_expression(lanes, argument, scope) for argument in call.arguments]
     if function == "where":
         return lanes.select(*arguments)

@@ -50,10 +50,10 @@ class StepEnvironment(Environment):
         if past.delay is None and past.offset == 0:
             return self.values[past.name]
         number = self.states.names.index(past.name)
-        place = self.half_steps
+        position = self.half_steps
         if self.is_in_equation:
-            place = reads.find_state_place(self.model, place, self.equation, number)
-        halves = place - 2 * past.offset
+            position = reads.find_state_position(self.model, position, self.equation, number)
+        halves = position - 2 * past.offset
         if past.delay is None:
             return self._emit_sample(past.name, -halves // 2)
         now = self.states.now[past.name]
@@ -68,11 +68,11 @@ class StepEnvironment(Environment):
         """Emit a delayed state: its history function before the start, else `value`."""
         lanes, delay = self.lanes, self.signals.get_state_delay(past)
         steps = lanes.builder.sitofp(self.time_step.index, DOUBLE)
-        place = lanes.add(steps, lanes.make_number(halves / 2))
-        is_before = lanes.compare("<", place, delay)
+        position = lanes.add(steps, lanes.make_number(halves / 2))
+        is_before = lanes.compare("<", position, delay)
 
         def emit_before() -> list[IrValue]:
-            time = lanes.mul(lanes.sub(place, delay), self.parameters.period)
+            time = lanes.mul(lanes.sub(position, delay), self.parameters.period)
             scope = HistoryEnvironment(self.parameters.values, self.parameters.period, time)
             return [lanes.select(is_before, emit_expression(lanes, history, scope), value)]
 
@@ -99,7 +99,7 @@ class StepEnvironment(Environment):
 
 
 class EnvironmentBuilder(Protocol):
-    """Function that builds the environment at a place, from the states' values there."""
+    """Function that builds the environment at a position, from the states' values there."""
 
     def __call__(
         self, halves: int, values: dict[str, IrValue], equation: int = 0

@@ -201,8 +201,8 @@ class _Block:
         b, lanes = self.lanes.builder, self.lanes
         last = lanes.make_integer(self.model.memory - 1)
         inside = b.select(b.icmp_signed("<", sample, last), sample, last)
-        place = b.add(self.experiment.get_state_field(i, "given"), inside)
-        return lanes.load_double(self.experiment.floats, place)
+        index = b.add(self.experiment.get_state_field(i, "given"), inside)
+        return lanes.load_double(self.experiment.floats, index)
 
 
 def _bind_environment(
@@ -213,7 +213,7 @@ def _bind_environment(
     signals: SignalReaders,
     time_step: TimeStep,
 ) -> EnvironmentBuilder:
-    """Bind the environment of this step; its places and the states' values stay open."""
+    """Bind the environment of this step; its positions and the states' values stay open."""
 
     def build_environment(
         halves: int, values: dict[str, IrValue], equation: int = 0

@@ -1,7 +1,7 @@
 """Layout of an experiment's numbers in the arrays `ints` and `floats`.
 
-Both arrays begin with a head of fixed places, which locates the data that follow. All places count
-from the beginning of the experiment.
+Both arrays begin with a head of fixed indices, which locates the data that follow. All indices
+count from the beginning of the experiment.
 """
 
 from dataclasses import dataclass
@@ -12,21 +12,21 @@ HEAD_FIELDS = ("last", "reach", "rows")
 """Last integration step; rows of history that delays reach back; rows of the buffer."""
 
 STATE_FIELDS = ("row", "given")
-"""Row of theta with the initial value, or -1; place of the measured first samples, or -1."""
+"""Row of theta with the initial value, or -1; index of the measured first samples, or -1."""
 
 INPUT_FIELDS = ("zero", "points", "begin", "end", "cap")
 """Fields of an input.
 
-Place of the value at step 0; fine points in a step; begin and end of a step in fine points (a held
+Index of the value at step 0; fine points in a step; begin and end of a step in fine points (a held
 input jumps, so they differ from 0 and `points`); largest delay in fine points.
 """
 
 OUTPUT_FIELDS = ("measured", "weight", "samples", "fraction", "first", "grid")
 """Fields of an output.
 
-Places of measured values and weights; place (in ints) of each grid point's row, or of the bounds of
-its interval's samples; place of the samples' positions in their interval; first row of the
-predictions; place of the measurement interpolated to the grid.
+Indices of measured values and weights; index (in ints) of each grid point's row, or of the bounds
+of its interval's samples; index of the samples' positions in their interval; first row of the
+predictions; index of the measurement interpolated to the grid.
 """
 
 FLOAT_FIELDS = ("step", "cap", "scale")
@@ -60,7 +60,7 @@ class KernelVariant:
 
 @dataclass(frozen=True, slots=True)
 class ExperimentLayout:
-    """Places of the head, for a model with these numbers of signals."""
+    """Indices of the head, for a model with these numbers of signals."""
 
     states: int
     inputs: int
@@ -72,11 +72,11 @@ class ExperimentLayout:
         return cls(len(model.states), len(model.inputs), len(model.outputs))
 
     def locate_state(self, number: int, field: str) -> int:
-        """Return the place (in ints) of a state's field."""
+        """Return the index (in ints) of a state's field."""
         return len(HEAD_FIELDS) + number * len(STATE_FIELDS) + STATE_FIELDS.index(field)
 
     def locate_input(self, number: int, field: str) -> int:
-        """Return the place (in ints) of an input's field."""
+        """Return the index (in ints) of an input's field."""
         return (
             self.locate_state(self.states, STATE_FIELDS[0])
             + number * len(INPUT_FIELDS)
@@ -84,7 +84,7 @@ class ExperimentLayout:
         )
 
     def locate_output(self, number: int, field: str) -> int:
-        """Return the place (in ints) of an output's field."""
+        """Return the index (in ints) of an output's field."""
         return (
             self.locate_input(self.inputs, INPUT_FIELDS[0])
             + number * len(OUTPUT_FIELDS)
@@ -102,9 +102,9 @@ class ExperimentLayout:
         return self.locate_first_input(self.inputs)
 
     def locate_initial(self, number: int) -> int:
-        """Return the place (in floats) of a state's initial value."""
+        """Return the index (in floats) of a state's initial value."""
         return len(FLOAT_FIELDS) + number
 
     def locate_first_input(self, number: int) -> int:
-        """Return the place (in floats) of an input's value at the start."""
+        """Return the index (in floats) of an input's value at the start."""
         return self.locate_initial(self.states) + number

@@ -95,8 +95,8 @@ class LossAccumulator:
         self.loss = lanes.add(self.loss, self._emit_cost(i, grid, value))
 
         def store() -> list[IrValue]:
-            place = b.add(self._experiment.get_output_field(i, "samples"), grid)
-            row = lanes.load_integer(self._experiment.ints, place)
+            index = b.add(self._experiment.get_output_field(i, "samples"), grid)
+            row = lanes.load_integer(self._experiment.ints, index)
             is_sample = b.icmp_signed(">=", row, lanes.make_integer(0))
             lanes.branch(is_sample, lambda: self._store_prediction(row, value), [])
             return []
@@ -112,9 +112,9 @@ class LossAccumulator:
         loop = KernelLoop(lanes)
         sample, loss = loop.carry(start), loop.carry(self.loss)
         loop.leave_if(b.icmp_signed(">=", sample, stop))
-        place = b.add(experiment.get_output_field(i, "fraction"), sample)
+        index = b.add(experiment.get_output_field(i, "fraction"), sample)
         between = lanes.interpolate(
-            self._earlier[i], lanes.load_double(experiment.floats, place), value
+            self._earlier[i], lanes.load_double(experiment.floats, index), value
         )
         following = lanes.add(loss, self._emit_cost(i, sample, between))
 
@@ -138,8 +138,8 @@ class LossAccumulator:
         )
         error = lanes.sub(value, measured)
         if self._variant.weighted:
-            place = b.add(experiment.get_output_field(i, "weight"), sample)
-            error = lanes.mul(error, lanes.load_double(experiment.floats, place))
+            index = b.add(experiment.get_output_field(i, "weight"), sample)
+            error = lanes.mul(error, lanes.load_double(experiment.floats, index))
         square = lanes.mul(error, error)
         if not self._variant.soft:
             return square
@@ -150,8 +150,8 @@ class LossAccumulator:
 
     def _store_prediction(self, row: IrValue, value: IrValue) -> list[IrValue]:
         b = self._lanes.builder
-        place = b.add(b.mul(row, self._arguments["predictions_stride"]), self._column)
-        self._lanes.store_row(value, self._arguments["predictions"], place)
+        index = b.add(b.mul(row, self._arguments["predictions_stride"]), self._column)
+        self._lanes.store_row(value, self._arguments["predictions"], index)
         return []
 
     def _replace_states(self, grid: IrValue, states: States) -> None:
@@ -159,6 +159,6 @@ class LossAccumulator:
         for i, output in enumerate(self._model.outputs):
             name = match_plain_state(output.expression)
             if name is not None:
-                place = self._lanes.builder.add(self._experiment.get_output_field(i, "grid"), grid)
-                value = self._lanes.load_double(self._experiment.floats, place)
+                index = self._lanes.builder.add(self._experiment.get_output_field(i, "grid"), grid)
+                value = self._lanes.load_double(self._experiment.floats, index)
                 states.now[name] = self._lanes.splat(value)

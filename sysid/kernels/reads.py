@@ -1,6 +1,6 @@
-"""Reads of a model: its past values and their places on the time axis.
+"""Reads of a model: its past values and their positions on the time axis.
 
-Places are counted in half integration steps from the last finished step. The stages of a
+Positions are counted in half integration steps from the last finished step. The stages of a
 Runge-Kutta step are at 0, 1 and 2. The sample that a difference equation computes is at 2.
 """
 
@@ -18,7 +18,7 @@ _MAX_GAP = 4  # half steps: two values at most this far apart share one read
 
 
 class SignalRead(NamedTuple):
-    """A past value and its place without its delay."""
+    """A past value and its position without its delay."""
 
     past: PastValue
     half_steps: int
@@ -30,14 +30,14 @@ def is_difference(model: Model) -> bool:
 
 
 def list_stages(model: Model) -> tuple[int, ...]:
-    """List the places at which the equations are evaluated in one step."""
+    """List the positions at which the equations are evaluated in one step."""
     if is_difference(model):
         return (2,)
     return (0, 1, 2) if model.solver.method == "rk4" else (0,)
 
 
-def find_state_place(model: Model, stage: int, equation: int, state: int) -> int:
-    """Find the place of a state's undelayed value, in an equation at a stage.
+def find_state_position(model: Model, stage: int, equation: int, state: int) -> int:
+    """Find the position of a state's undelayed value, in an equation at a stage.
 
     The semi-implicit method reads updated states at the end of the step.
     """
@@ -54,8 +54,10 @@ def collect_reads(model: Model) -> tuple[SignalRead, ...]:
         for stage in list_stages(model):
             for past in collect_past_values(equation):
                 state = past.kind == "state"
-                place = find_state_place(model, stage, i, numbers[past.name]) if state else stage
-                signal_reads.append(SignalRead(past, place - 2 * past.offset))
+                position = (
+                    find_state_position(model, stage, i, numbers[past.name]) if state else stage
+                )
+                signal_reads.append(SignalRead(past, position - 2 * past.offset))
     for output in model.outputs:
         signal_reads += [
             SignalRead(past, -2 * past.offset) for past in collect_past_values(output.expression)
@@ -116,18 +118,18 @@ def list_stored_histories(model: Model) -> list[StoredHistory]:
     """List the histories that must be stored in memory."""
     if not reads_cubics(model):
         return [StoredHistory(name, None, 1) for name in _list_states_with_history(model)]
-    places = group_delayed_reads(model, "state")
-    return [StoredHistory(*past, 2 if max(places[past]) > 0 else 1) for past in places]
+    positions = group_delayed_reads(model, "state")
+    return [StoredHistory(*past, 2 if max(positions[past]) > 0 else 1) for past in positions]
 
 
 def group_delayed_reads(model: Model, kind: str) -> dict[tuple[str, Expression], set[int]]:
-    """Group the places of reads of one kind with a constant delay, by signal and delay."""
-    places: dict[tuple[str, Expression], set[int]] = {}
+    """Group the positions of reads of one kind with a constant delay, by signal and delay."""
+    positions: dict[tuple[str, Expression], set[int]] = {}
     for read in collect_reads(model):
         is_constant = read.past.delay is not None and not has_varying_delay(read.past)
         if read.past.kind == kind and read.past.delay is not None and is_constant:
-            places.setdefault((read.past.name, read.past.delay), set()).add(read.half_steps)
-    return places
+            positions.setdefault((read.past.name, read.past.delay), set()).add(read.half_steps)
+    return positions
 
 
 def _list_states_with_history(model: Model) -> list[str]:
@@ -156,17 +158,17 @@ def find_furthest_offset(model: Model) -> int:
     return max([0, *(-(r.half_steps // 2) for r in collect_reads(model))])
 
 
-def group_places(places: set[int]) -> list[list[int]]:
-    """Group places so that each group needs one read; the others are earlier values of it.
+def group_positions(positions: set[int]) -> list[list[int]]:
+    """Group positions so that each group needs one read; the others are earlier values of it.
 
-    Each group holds the place that is read, followed step by step by the earlier places.
+    Each group holds the position that is read, followed step by step by the earlier positions.
     """
     groups: list[list[int]] = []
     for parity in (0, 1):
-        for place in sorted((p for p in places if p % 2 == parity), reverse=True):
+        for position in sorted((p for p in positions if p % 2 == parity), reverse=True):
             last = groups[-1] if groups else None
-            if last and last[0] % 2 == parity and last[-1] - place <= _MAX_GAP:
-                last.extend(range(last[-1] - 2, place - 1, -2))
+            if last and last[0] % 2 == parity and last[-1] - position <= _MAX_GAP:
+                last.extend(range(last[-1] - 2, position - 1, -2))
             else:
-                groups.append([place])
+                groups.append([position])
     return groups

@@ -34,21 +34,23 @@ class SignalReaders:
         self._readers: dict[tuple[str, Expression, int], DelayedReader] = {}
         self._owners: list[tuple[str, DelayedReader]] = []
         cubic = model.solver.interpolation == "cubic"
-        for past, places in reads.group_delayed_reads(model, "state").items():
+        for past, positions in reads.group_delayed_reads(model, "state").items():
             delay = lanes.clamp(delays.to_steps(past[1]), experiment.get_number("cap"))
             if reads.reads_cubics(model):
-                self._add_reader(past, places, CubicReader(lanes, states, past, delay))
+                self._add_reader(past, positions, CubicReader(lanes, states, past, delay))
                 continue
             history = states.get_history(past[0])
             if one_step or cubic:
-                self._add_reader(past, places, DirectReader(lanes, history, delay, places, cubic))
+                self._add_reader(
+                    past, positions, DirectReader(lanes, history, delay, positions, cubic)
+                )
                 continue
-            for chain in _group_state_places(places):
+            for chain in _group_state_positions(positions):
                 reader = LinearReader(lanes, history, delay, chain, experiment.get_head("reach"))
-                served = places if chain[0] > 0 else set()
+                served = positions if chain[0] > 0 else set()
                 self._add_reader(past, {*chain, *(p for p in served if p > 0)}, reader)
-        for past, places in reads.group_delayed_reads(model, "input").items():
-            for chain in reads.group_places(places):
+        for past, positions in reads.group_delayed_reads(model, "input").items():
+            for chain in reads.group_positions(positions):
                 self._add_reader(
                     past,
                     {*chain},
@@ -56,10 +58,10 @@ class SignalReaders:
                 )
 
     def _add_reader(
-        self, past: tuple[str, Expression], places: set[int], reader: DelayedReader
+        self, past: tuple[str, Expression], positions: set[int], reader: DelayedReader
     ) -> None:
-        for place in places:
-            self._readers[*past, place] = reader
+        for position in positions:
+            self._readers[*past, position] = reader
         self._owners.append((past[0], reader))
 
     def _build_input_reader(self, name: str, delay: IrValue, chain: list[int]) -> InputReader:
@@ -71,14 +73,14 @@ class SignalReaders:
         return InputReader(lanes, experiment.floats, zero, points, lanes.clamp(fine, cap), chain)
 
     def _find_input_start(self, number: int) -> IrValue:
-        """Find the place of an input at step 0; difference equations read just after a jump."""
+        """Find the position of an input at step 0; difference equations read just after a jump."""
         zero = self._experiment.get_input_field(number, "zero")
         if not reads.is_difference(self._model):
             return zero
         return self._lanes.builder.add(zero, self._experiment.get_input_field(number, "begin"))
 
     def get_reader(self, past: PastValue, halves: int) -> DelayedReader:
-        """Return the reader of a delayed signal at a place."""
+        """Return the reader of a delayed signal at a position."""
         if past.delay is None:
             raise AssertionError(f"{past.name} is read without delay")
         return self._readers[past.name, past.delay, halves]
@@ -92,7 +94,7 @@ class SignalReaders:
     def read_varying_input(
         self, past: PastValue, halves: int, time_step: TimeStep, scope: Environment
     ) -> IrValue:
-        """Read an input whose delay depends on present inputs, once for this place."""
+        """Read an input whose delay depends on present inputs, once for this position."""
         if past.delay is None:
             raise AssertionError(f"{past.name} is read without delay")
         steps = self._delays.to_present_steps(past.delay, scope)
@@ -128,7 +130,9 @@ class SignalReaders:
             reader.end_step(loop, following.get(name, self._lanes.make_number(0.0)))
 
 
-def _group_state_places(places: set[int]) -> list[list[int]]:
+def _group_state_positions(positions: set[int]) -> list[list[int]]:
     """Group whole steps into chains; one that reaches the present step has its start too."""
-    forward = {0, 2} if any(place > 0 for place in places) else set()
-    return reads.group_places({place for place in places if place % 2 == 0} | forward)
+    forward = {0, 2} if any(position > 0 for position in positions) else set()
+    return reads.group_positions(
+        {position for position in positions if position % 2 == 0} | forward
+    )

@@ -193,8 +193,8 @@ class States:
         self._histories: dict[tuple[str, Expression | None], StateHistory] = {}
         first_column = 0
         for stored in reads.list_stored_histories(model):
-            place = lanes.builder.mul(size, lanes.make_integer(first_column))
-            base = lanes.builder.gep(work, [place], source_etype=DOUBLE)
+            offset = lanes.builder.mul(size, lanes.make_integer(first_column))
+            base = lanes.builder.gep(work, [offset], source_etype=DOUBLE)
             self._histories[stored.state, stored.delay] = StateHistory(base, stored.columns)
             first_column += stored.columns
         self.line: dict[str, list[IrValue]] = {}

@@ -22,13 +22,13 @@ def emit_table(
     pieces = _Pieces(lanes, x, y)
     coefficients = pieces.emit_cubics() if is_cubic else [(rise,) for rise in pieces.rises]
     result = y[0]
-    for place, value, factors in zip(x, y, coefficients, strict=False):
-        beyond = lanes.sub(argument, lanes.make_number(place))
+    for position, value, factors in zip(x, y, coefficients, strict=False):
+        beyond = lanes.sub(argument, lanes.make_number(position))
         inside = factors[-1]
         for factor in reversed(factors[:-1]):
             inside = lanes.add(factor, lanes.mul(beyond, inside))
         inside = lanes.add(value, lanes.mul(beyond, inside))
-        is_reached = lanes.compare(">=", argument, lanes.make_number(place))
+        is_reached = lanes.compare(">=", argument, lanes.make_number(position))
         result = lanes.select(is_reached, inside, result)
     is_behind = lanes.compare(">=", argument, lanes.make_number(x[-1]))
     result = lanes.select(is_behind, y[-1], result)

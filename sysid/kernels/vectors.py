@@ -280,8 +280,8 @@ class VectorBuilder:
         for number in range(self.width):
             lane = ir.Constant(_INT32, number)
             start = b.inttoptr(b.extract_element(addresses, lane), ir.PointerType())
-            place = b.gep(start, [step], source_etype=ir.IntType(8))
-            gathered = b.insert_element(gathered, b.load(place, typ=DOUBLE, align=8), lane)
+            address = b.gep(start, [step], source_etype=ir.IntType(8))
+            gathered = b.insert_element(gathered, b.load(address, typ=DOUBLE, align=8), lane)
         return gathered
 
     def gather_pairs(self, addresses: IrValue, shift: IrValue) -> list[IrValue]:
@@ -294,8 +294,8 @@ class VectorBuilder:
             start = b.inttoptr(
                 b.extract_element(addresses, ir.Constant(_INT32, number)), ir.PointerType()
             )
-            place = b.gep(start, [step], source_etype=ir.IntType(8))
-            parts.append(b.load(place, typ=pair, align=8))
+            address = b.gep(start, [step], source_etype=ir.IntType(8))
+            parts.append(b.load(address, typ=pair, align=8))
         whole = self._join_vectors(parts)
         nothing = ir.Constant(whole.type, ir.Undefined)
         masks = [_make_shuffle_mask(range(side, 2 * self.width, 2)) for side in (0, 1)]
@@ -307,8 +307,8 @@ class VectorBuilder:
         signature = ir.FunctionType(ir.VoidType(), [pointer, pointer, INT, BOOL])
         copy = self._declare_function("llvm.memcpy.p0.p0.i64", signature)
         size = self.builder.shl(doubles, self.make_integer(3))
-        places = [self._compute_address(base, target), self._compute_address(base, source)]
-        self.builder.call(copy, [*places, size, ir.Constant(BOOL, 0)])
+        addresses = [self._compute_address(base, target), self._compute_address(base, source)]
+        self.builder.call(copy, [*addresses, size, ir.Constant(BOOL, 0)])
 
     # ---- control --------------------------------------------------------------------------
     def branch(
@@ -345,9 +345,9 @@ def _is_product(value: IrValue) -> bool:
     return getattr(value, "opname", "") == "fmul"
 
 
-def _make_shuffle_mask(places: Sequence[int]) -> IrValue:
+def _make_shuffle_mask(lanes: Sequence[int]) -> IrValue:
     """Make the mask of the lanes that a shuffle takes."""
-    return ir.Constant(ir.VectorType(_INT32, len(places)), list(places))
+    return ir.Constant(ir.VectorType(_INT32, len(lanes)), list(lanes))
 
 
 class KernelLoop:

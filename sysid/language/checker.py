@@ -43,7 +43,7 @@ from sysid.language.tree import (
 MAX_NODES = 10_000
 """Numbers, names, operators and functions of a model; compiling takes milliseconds for each."""
 
-_MAX_PLACE, _MIN_GAP = 1e100, 1e-100  # of the x of a table: squares of gaps must be numbers
+_MAX_POSITION, _MIN_GAP = 1e100, 1e-100  # of the x of a table: squares of gaps must be numbers
 _PI = 3.141592653589793
 _ZERO = Number(0.0)
 
@@ -244,7 +244,7 @@ class _ExpressionChecker:
                 )
         x, y = (
             [
-                (self._check_point(item, depth + 1, is_place=points is lists[0]), item.column)
+                (self._check_point(item, depth + 1, is_position=points is lists[0]), item.column)
                 for item in points.items
             ]
             for points in lists
@@ -259,21 +259,23 @@ class _ExpressionChecker:
             return self._add_fault(node.column, detail)
         if len(self._faults) == faults_before:
             self._check_increase(x)
-        return FunctionCall(node.name, (tree, *(place for place, _ in x), *(v for v, _ in y)))
+        return FunctionCall(node.name, (tree, *(position for position, _ in x), *(v for v, _ in y)))
 
-    def _check_point(self, item: SyntaxNode, depth: int, *, is_place: bool) -> Expression:
+    def _check_point(self, item: SyntaxNode, depth: int, *, is_position: bool) -> Expression:
         """Check one number of a table: an x is a number, a y may have parameters."""
         outside, self.uses = self.uses, []
         tree, read = self.check_value(item, depth), self.uses
         self.uses = outside
         symbols = [node for node in walk(tree) if isinstance(node, Symbol)]
-        if is_place:
+        if is_position:
             if read or symbols:
                 detail = "the x of a table are numbers; only its y may have parameters"
                 return self._add_fault(item.column, detail)
             value = evaluate_expression(tree, {})
-            if not abs(value) <= _MAX_PLACE:
-                detail = f"this x of the table is {value:g}; need a number within ±{_MAX_PLACE:g}"
+            if not abs(value) <= _MAX_POSITION:
+                detail = (
+                    f"this x of the table is {value:g}; need a number within ±{_MAX_POSITION:g}"
+                )
                 return self._add_fault(item.column, detail)
             return Number(value)
         if read or any(symbol.kind in ("time", "index") for symbol in symbols):
@@ -288,13 +290,13 @@ class _ExpressionChecker:
         return tree
 
     def _check_increase(self, x: Sequence[tuple[Expression, int]]) -> None:
-        """Check that the places of a table increase."""
-        for (before, _), (place, column) in pairwise(x):
-            if isinstance(before, Number) and isinstance(place, Number):
-                if place.value - before.value >= _MIN_GAP:
+        """Check that the positions of a table increase."""
+        for (before, _), (position, column) in pairwise(x):
+            if isinstance(before, Number) and isinstance(position, Number):
+                if position.value - before.value >= _MIN_GAP:
                     continue
-                low, high = format_number(before.value), format_number(place.value)
-                need = f", by {_MIN_GAP:g} or more" if place.value > before.value else ""
+                low, high = format_number(before.value), format_number(position.value)
+                need = f", by {_MIN_GAP:g} or more" if position.value > before.value else ""
                 detail = f"the x of a table must increase{need}, but {high} follows {low}"
                 self._add_fault(column, detail)
 

@@ -29,8 +29,8 @@ def split_table(call: FunctionCall) -> LookupTable:
     """Split a call of a table into its argument and its points."""
     argument, *points = call.arguments
     count = len(points) // 2
-    places = tuple(node.value for node in points[:count] if isinstance(node, Number))
-    return LookupTable(argument, places, tuple(points[count:]))
+    positions = tuple(node.value for node in points[:count] if isinstance(node, Number))
+    return LookupTable(argument, positions, tuple(points[count:]))
 
 
 def evaluate_table(function: str, argument: FloatArray, *points: FloatArray) -> FloatArray:

@@ -36,8 +36,8 @@ from sysid.uncertainty.intervals import mark_poor_intervals
 from sysid.uncertainty.linear_model import LinearOutputModel, factor_covariance, make_move_generator
 
 _DRAW_DEVIATIONS = np.array([0.5, 1.0, 2.0, 3.0])  # standard errors
-_ROUGHNESS_PLACES = 24  # points that show whether the loss is rough
-_PLACES_PER_ROUND = 192  # points in a round
+_ROUGHNESS_POINTS = 24  # points that show whether the loss is rough
+_POINTS_PER_ROUND = 192  # points in a round
 _STARTS_PER_ROUND = 8  # of these: the lowest compared to the linear model
 _MAX_ROUNDS = 2
 _MAX_STEPS = 12  # of least squares from each point
@@ -84,7 +84,7 @@ def count_affordable_simulations(
         experiment.grid.points * experiment.grid.substeps for experiment in problem.experiments
     )
     limit = min(most, (_MAX_LATE_WORK if is_late else _MAX_WORK) // max(steps, 1))
-    return limit if limit >= _ROUGHNESS_PLACES else 0
+    return limit if limit >= _ROUGHNESS_POINTS else 0
 
 
 def find_local_minima(
@@ -138,17 +138,17 @@ class _LocalSearch:
 
     def is_rough(self, centre: RefinedCandidate) -> bool:
         """Whether losses around differ from the linear model; no, if the budget is spent."""
-        if self._budget - self.evaluations < _ROUGHNESS_PLACES:
+        if self._budget - self.evaluations < _ROUGHNESS_POINTS:
             return False
-        _, _, expected, beyond = self._draw_places(centre, _ROUGHNESS_PLACES)
+        _, _, expected, beyond = self._draw_points(centre, _ROUGHNESS_POINTS)
         return bool(np.any(~(np.abs(beyond) <= _ROUGHNESS_TOLERANCE * np.maximum(expected, 1.0))))
 
     def refine_starts(self, centre: RefinedCandidate) -> list[RefinedCandidate]:
         """Refine the most promising points around by least squares."""
-        count = min(_PLACES_PER_ROUND, (self._budget - self.evaluations) // 2)
-        if count < _ROUGHNESS_PLACES:
+        count = min(_POINTS_PER_ROUND, (self._budget - self.evaluations) // 2)
+        if count < _ROUGHNESS_POINTS:
             return []
-        starts, values, _, beyond = self._draw_places(centre, count)
+        starts, values, _, beyond = self._draw_points(centre, count)
         ends = []
         for i in np.argsort(beyond, kind="stable")[:_STARTS_PER_ROUND]:
             left = self._budget - self.evaluations
@@ -172,7 +172,7 @@ class _LocalSearch:
             size *= _SPREAD_GROWTH if gains else _SPREAD_DECAY
         return RefinedCandidate(theta, rms, 0)
 
-    def _draw_places(
+    def _draw_points(
         self, centre: RefinedCandidate, count: int
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Draw points; return them, their RMS, the expected likelihood ratio and its excess."""

@@ -2,7 +2,7 @@
 
 A search ends in one of several minima where the loss is a comb in a time lag, where the input is
 periodic, or where the model has mirror images. From the best estimate each parameter alone is
-moved over its whole range, time lags first, with all places in one batch. Least squares continues
+moved over its whole range, time lags first, with all points in one batch. Least squares continues
 from the lowest dips. If it ends lower, the scan is repeated from there.
 
 All ends are kept, those of the search too (`sysid.search.archive`). The data do not rule out a
@@ -21,9 +21,9 @@ import numpy as np
 
 from sysid.core.types import BoolArray, FloatArray
 from sysid.core.units import format_unit
-from sysid.minima.projection import draw_projected_places
+from sysid.minima.projection import draw_projected_points
 from sysid.results.parts import CHI_SQUARE_95, Minimum
-from sysid.search.archive import SAME_PLACE, ArchivedMinimum
+from sysid.search.archive import SAME_POINT, ArchivedMinimum
 from sysid.search.refine import RefinedCandidate, refine_candidate
 from sysid.search.state import SAME_OPTIMUM
 from sysid.simulation.problem import Problem
@@ -31,7 +31,7 @@ from sysid.simulation.scaling import from_unit, to_unit
 from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.linear_model import LinearOutputModel
 
-_DELAY_PLACES, _PLACES = 128, 16  # of a scan: over the range of a time lag, of another parameter
+_DELAY_POINTS, _POINTS = 128, 16  # of a scan: over the range of a time lag, of another parameter
 _STARTS, _STARTS_IN_DOUBT = 6, 12  # dips from which least squares continues, in a round
 _TRIAL_STEPS, _MAX_STEPS = 4, 60  # of least squares from each, and from a promising one
 _PROMISING = 1.5  # times the RMS of the best: least squares continues below it
@@ -71,7 +71,7 @@ class FoundMinima(NamedTuple):
 class ScanResult(NamedTuple):
     """Best candidate after a scan, with all ends of least squares and the simulations spent.
 
-    `starts`: the places from which least squares continued.
+    `starts`: the points from which least squares continued.
     """
 
     best: RefinedCandidate
@@ -110,10 +110,10 @@ def scan_parameters(
         spent += sum(series.values.size - 1 for series in scanned)
         dips = _find_dips(scanned, problem.output_scale)
         dips = dips[: _STARTS_IN_DOUBT if is_doubtful else _STARTS]
-        found, count = _refine_dips(problem, dips, best.rms, budget - spent, is_late)
+        refined, count = _refine_dips(problem, dips, best.rms, budget - spent, is_late)
         spent += count
-        ends += found
-        reached = min(best, *found, key=lambda candidate: candidate.rms) if found else best
+        ends += refined
+        reached = min(best, *refined, key=lambda candidate: candidate.rms) if refined else best
         gains = reached.rms < best.rms * (1.0 - SAME_OPTIMUM)
         best = reached
         if not gains:
@@ -129,12 +129,12 @@ def scan_by_projection(
     is_late: Callable[[], bool] | None = None,
 ) -> ScanResult:
     """Scan the whole range with the linear parameters solved for (`projection`)."""
-    places, fitness, spent = draw_projected_places(problem, start.theta, seed, budget)
+    points, fitness, spent = draw_projected_points(problem, start.theta, seed, budget)
     order = np.argsort(fitness, kind="stable")
-    dips = [(places[i], float(fitness[i])) for i in order if fitness[i] < problem.output_scale]
-    found, count = _refine_dips(problem, dips[:_STARTS], start.rms, budget - spent, is_late)
-    best = min(start, *found, key=lambda candidate: candidate.rms) if found else start
-    return ScanResult(best, (start, *found), spent + count, len(dips[:_STARTS]))
+    dips = [(points[i], float(fitness[i])) for i in order if fitness[i] < problem.output_scale]
+    refined, count = _refine_dips(problem, dips[:_STARTS], start.rms, budget - spent, is_late)
+    best = min(start, *refined, key=lambda candidate: candidate.rms) if refined else start
+    return ScanResult(best, (start, *refined), spent + count, len(dips[:_STARTS]))
 
 
 def _refine_dips(
@@ -147,10 +147,10 @@ def _refine_dips(
     """Refine dips, and further only those that come near the best RMS; count the simulations."""
     ends: list[RefinedCandidate] = []
     spent = 0
-    for place, rms in dips:
+    for point, rms in dips:
         if is_late is not None and is_late():
             break
-        trial = refine_candidate(problem, place, rms, budget - spent, _TRIAL_STEPS)
+        trial = refine_candidate(problem, point, rms, budget - spent, _TRIAL_STEPS)
         if trial is None:
             break
         spent += trial.evaluations
@@ -177,20 +177,20 @@ def continue_from_archive(
     """
     if not archived or len(archived) > budget:
         return [], 0
-    places = from_unit(problem.evaluator, np.array([one.place for one in archived]))
-    fitness, spent = problem.evaluate_fitness(places), len(archived)
+    points = from_unit(problem.evaluator, np.array([one.point for one in archived]))
+    fitness, spent = problem.evaluate_fitness(points), len(archived)
     best = min(end.rms for end in ends)
-    units, known = to_unit(problem.evaluator, places), [*ends]
+    units, known = to_unit(problem.evaluator, points), [*ends]
     known_units = [*to_unit(problem.evaluator, np.array([end.theta for end in ends]))]
     fits: list[Fit] = []
     continued = 0
     for i in np.argsort(fitness, kind="stable"):
-        theta, rms, count = places[i], float(fitness[i]), archived[i].count
+        theta, rms, count = points[i], float(fitness[i]), archived[i].count
         if not rms < _PROMISING * best:
             break
         distances = _compute_distances(np.array(known_units), units[i])
         nearest = int(np.argmin(distances))
-        same = _SAME_VALLEY if rms <= best * (1.0 + SAME_OPTIMUM) else SAME_PLACE
+        same = _SAME_VALLEY if rms <= best * (1.0 + SAME_OPTIMUM) else SAME_POINT
         if distances[nearest] < same:
             fits.append(Fit(known[nearest].theta, known[nearest].rms, count, count))
             continue
@@ -207,9 +207,9 @@ def continue_from_archive(
 
 
 class _Series(NamedTuple):
-    """Places with one parameter moved, in ascending order, and their fitness; the centre too."""
+    """Points with one parameter moved, in ascending order, and their fitness; the centre too."""
 
-    places: FloatArray
+    points: FloatArray
     values: FloatArray
     centre: int
 
@@ -225,7 +225,7 @@ def _scan_around(
     middle = to_unit(problem.evaluator, centre.theta[None])[0]
     scanned, moved = [], []
     for d in (*delays, *others):
-        count = _DELAY_PLACES if d in delays else _PLACES
+        count = _DELAY_POINTS if d in delays else _POINTS
         budget -= count
         if budget < 0:
             break
@@ -235,19 +235,19 @@ def _scan_around(
         moved.append(series)
     if not moved:
         return []
-    places = from_unit(problem.evaluator, np.concatenate(moved))
+    points = from_unit(problem.evaluator, np.concatenate(moved))
     ends = np.cumsum([len(series) for series in moved])[:-1]
-    fitness = problem.evaluate_fitness(places)
+    fitness = problem.evaluate_fitness(points)
     return [
         _insert_centre(theta, values, series[:, d], middle[d], centre)
         for theta, values, series, d in zip(
-            np.split(places, ends), np.split(fitness, ends), moved, scanned, strict=True
+            np.split(points, ends), np.split(fitness, ends), moved, scanned, strict=True
         )
     ]
 
 
 def _insert_centre(
-    places: FloatArray,
+    points: FloatArray,
     values: FloatArray,
     unit: FloatArray,
     middle: float,
@@ -255,24 +255,24 @@ def _insert_centre(
 ) -> _Series:
     at = int(np.searchsorted(unit, middle))
     return _Series(
-        np.concatenate([places[:at], centre.theta[None], places[at:]]),
+        np.concatenate([points[:at], centre.theta[None], points[at:]]),
         np.concatenate([values[:at], [centre.rms], values[at:]]),
         at,
     )
 
 
 def _find_dips(scanned: Sequence[_Series], limit: float) -> list[tuple[FloatArray, float]]:
-    """Find the lowest local minima of the series, without their centre: places and fitness.
+    """Find the lowest local minima of the series, without their centre: points and fitness.
 
     Above the limit, the RMS of the mean of the output, the model explains nothing.
     """
     dips = []
-    for places, values, centre in scanned:
+    for points, values, centre in scanned:
         framed = np.full(values.size + 2, np.inf)
         np.copyto(framed[1:-1], values, where=np.isfinite(values))
         is_dip = (framed[1:-1] < framed[:-2]) & (framed[1:-1] <= framed[2:]) & (values < limit)
         is_dip[centre] = False
-        dips += [(places[i], float(values[i])) for i in np.flatnonzero(is_dip)]
+        dips += [(points[i], float(values[i])) for i in np.flatnonzero(is_dip)]
     return sorted(dips, key=lambda dip: dip[1])
 
 
@@ -290,7 +290,7 @@ def collect_minima(
     n = problem.n_scored * _get_variance_ratio(linear)
     ordered = sorted(fits, key=lambda fit: fit.rms)
     units = to_unit(problem.evaluator, np.array([fit.theta for fit in ordered]))
-    are_close = (_compute_distances(units[:, None], units) < SAME_PLACE).tolist()
+    are_close = (_compute_distances(units[:, None], units) < SAME_POINT).tolist()
     groups: list[list[int]] = []
     ratios: list[float] = []
     for i, fit in enumerate(ordered):
@@ -331,42 +331,42 @@ def _get_variance_ratio(linear: LinearOutputModel | None) -> float:
 def _is_in_valley(
     problem: Problem, linear: LinearOutputModel, n: float, theta: FloatArray, best: FloatArray
 ) -> bool:
-    """Whether the data do not rule out a place (D,), by the linear model at the best minimum.
+    """Whether the data do not rule out a point (D,), by the linear model at the best minimum.
 
     A parameter that is on a plateau or has no variance is not in the model. It must not move.
     """
-    places = to_unit(problem.evaluator, np.array([theta, best]))
+    points = to_unit(problem.evaluator, np.array([theta, best]))
     is_left_out = ~np.isfinite(linear.variance_ratio)
-    if np.any(np.abs(places[0] - places[1])[is_left_out] >= SAME_PLACE):
+    if np.any(np.abs(points[0] - points[1])[is_left_out] >= SAME_POINT):
         return False
     (increase,) = linear.predict_relative_increase((theta - best)[None])
     return bool(n * np.log1p(increase) <= CHI_SQUARE_95)
 
 
-def is_same_place(problem: Problem, first: FloatArray, second: FloatArray) -> bool:
+def is_same_point(problem: Problem, first: FloatArray, second: FloatArray) -> bool:
     """Whether two ends (D,) of least squares are one minimum."""
-    return compute_distance(problem, first, second) < SAME_PLACE
+    return compute_distance(problem, first, second) < SAME_POINT
 
 
 def compute_distance(problem: Problem, first: FloatArray, second: FloatArray) -> float:
-    """Compute the largest distance of two places (D,) in one parameter, as a share of its range."""
-    places = to_unit(problem.evaluator, np.array([first, second]))
-    return float(_compute_distances(places[:1], places[1])[0])
+    """Compute the largest distance of two points (D,) in one parameter, as a share of its range."""
+    points = to_unit(problem.evaluator, np.array([first, second]))
+    return float(_compute_distances(points[:1], points[1])[0])
 
 
 def find_nearest(problem: Problem, minima: Sequence[Minimum], theta: FloatArray) -> Minimum:
-    """Find the minimum nearest to a place (D,)."""
-    places = to_unit(problem.evaluator, np.array([*(one.values for one in minima), theta]))
-    return minima[int(np.argmin(_compute_distances(places[:-1], places[-1])))]
+    """Find the minimum nearest to a point (D,)."""
+    points = to_unit(problem.evaluator, np.array([*(one.values for one in minima), theta]))
+    return minima[int(np.argmin(_compute_distances(points[:-1], points[-1])))]
 
 
 def _compute_distances(units: FloatArray, unit: FloatArray) -> FloatArray:
-    """Compute the largest difference (…) of places (…, D) in [0, 1] from another one (D,)."""
+    """Compute the largest difference (…) of points (…, D) in [0, 1] from another one (D,)."""
     return np.asarray(np.abs(units - unit).max(axis=-1, initial=0.0))
 
 
 def mark_ambiguous(
-    problem: Problem, estimates: tuple[Estimate, ...], found: FoundMinima
+    problem: Problem, estimates: tuple[Estimate, ...], minima: FoundMinima
 ) -> tuple[Estimate, ...]:
     """Mark estimates that differ between the minima that the data do not rule out.
 
@@ -384,7 +384,7 @@ def mark_ambiguous(
         for pair in _pair_with_own(
             problem,
             theta,
-            [m for m in found.minima if (m.recorded_from is not None) == is_recorded],
+            [m for m in minima.minima if (m.recorded_from is not None) == is_recorded],
             compared,
         )
     ]

@@ -1,7 +1,7 @@
-"""Places over the whole range with the linear parameters solved for, by variable projection.
+"""Points over the whole range with the linear parameters solved for, by variable projection.
 
 The output of a linear plant depends linearly on gains, offsets and initial states. Wide bounds of
-these hide the minimum in the others, a time lag above all: at a random place they are all wrong
+these hide the minimum in the others, a time lag above all: at a random point they are all wrong
 together. For given other parameters the best linear ones follow from one linear least-squares
 problem (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413). So only the
 others are drawn, by Latin hypercube sampling.
@@ -16,55 +16,55 @@ from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit
 from sysid.uncertainty.linear_model import make_move_generator
 
-_PLACES = 512
-_FEWEST_PLACES = 32
-_SHARE = 0.6  # of the budget; least squares from the best places takes the rest
+_POINTS = 512
+_FEWEST_POINTS = 32
+_SHARE = 0.6  # of the budget; least squares from the best points takes the rest
 _REACH = 0.25  # of the range: moves that test whether a parameter is linear
 _TOLERANCE = 1e-6  # of the change of the output
 _MAX_VALUES = 4_000_000  # of the outputs simulated at once: 32 MB
 
 
 def find_linear_parameters(problem: Problem, theta: FloatArray) -> tuple[list[int], int]:
-    """Find free parameters on which the outputs depend linearly, all together, at a place (D,).
+    """Find free parameters on which the outputs depend linearly, all together, at a point (D,).
 
     Returns their numbers, and the simulations that the test took.
     """
     moves = _choose_moves(problem, theta)
-    places = np.concatenate([theta[None], theta + np.diag(moves), theta + np.diag(0.5 * moves)])
-    base, *moved = problem.predict(places)
+    points = np.concatenate([theta[None], theta + np.diag(moves), theta + np.diag(0.5 * moves)])
+    base, *moved = problem.predict(points)
     full, half = np.array(moved[: theta.size]) - base, np.array(moved[theta.size :]) - base
-    spent = len(places)
+    spent = len(points)
     linear: list[int] = []
     for d in range(theta.size):
         if not _is_same(full[d], 2.0 * half[d]):
             continue
         together = [*linear, d]
         if linear:
-            place = theta.copy()
-            place[together] += moves[together]
+            point = theta.copy()
+            point[together] += moves[together]
             spent += 1
-            if not _is_same(problem.predict(place[None])[0] - base, full[together].sum(axis=0)):
+            if not _is_same(problem.predict(point[None])[0] - base, full[together].sum(axis=0)):
                 continue
         linear = together
     return linear, spent
 
 
-def draw_projected_places(
+def draw_projected_points(
     problem: Problem, theta: FloatArray, seed: int, budget: int
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Draw places over the whole range, with the linear parameters solved for.
+    """Draw points over the whole range, with the linear parameters solved for.
 
     Parameters
     ----------
     theta : FloatArray, shape (D,)
         Where the linear parameters are tested.
     budget : int
-        Simulations at most. If they suffice for few places only, or if no parameter is linear,
+        Simulations at most. If they suffice for few points only, or if no parameter is linear,
         there are none.
 
     Returns
     -------
-    places : FloatArray, shape (P, D)
+    points : FloatArray, shape (P, D)
     fitness : FloatArray, shape (P,)
     evaluations : int
     """
@@ -72,19 +72,19 @@ def draw_projected_places(
     if budget < 3 * theta.size + 1:
         return *nothing, 0
     linear, spent = find_linear_parameters(problem, theta)
-    count = min(_PLACES, int(_SHARE * (budget - spent)) // (len(linear) + 2))
-    if not linear or len(linear) == theta.size or count < _FEWEST_PLACES:
+    count = min(_POINTS, int(_SHARE * (budget - spent)) // (len(linear) + 2))
+    if not linear or len(linear) == theta.size or count < _FEWEST_POINTS:
         return *nothing, spent
     random = make_move_generator(seed)
     unit = np.array([random.permutation(count) for _ in theta]).T
-    places = from_unit(problem.evaluator, (unit + random.random(unit.shape)) / count)
-    places[:, linear] = theta[linear]
+    points = from_unit(problem.evaluator, (unit + random.random(unit.shape)) / count)
+    points[:, linear] = theta[linear]
     at_once = max(1, _MAX_VALUES // ((len(linear) + 1) * problem.evaluator.weight.size))
     moves = _choose_moves(problem, theta)
     for first in range(0, count, at_once):
-        part = places[first : first + at_once]
+        part = points[first : first + at_once]
         _solve_linear_parameters(problem, part, linear, moves[linear])
-    return places, problem.evaluate_fitness(places), spent + count * (len(linear) + 2)
+    return points, problem.evaluate_fitness(points), spent + count * (len(linear) + 2)
 
 
 def _choose_moves(problem: Problem, theta: FloatArray) -> FloatArray:
@@ -103,21 +103,21 @@ def _is_same(change: FloatArray, expected: FloatArray) -> bool:
 
 
 def _solve_linear_parameters(
-    problem: Problem, places: FloatArray, linear: list[int], moves: FloatArray
+    problem: Problem, points: FloatArray, linear: list[int], moves: FloatArray
 ) -> None:
-    """Replace the linear parameters of places (P, D) by the best ones inside their bounds."""
+    """Replace the linear parameters of points (P, D) by the best ones inside their bounds."""
     rows, evaluator = problem.scored_rows, problem.evaluator
     weight = evaluator.weight[rows]
-    moved = np.repeat(places[:, None], len(linear) + 1, axis=1)
+    moved = np.repeat(points[:, None], len(linear) + 1, axis=1)
     for i, d in enumerate(linear):
         moved[:, 1 + i, d] += moves[i]
     with np.errstate(all="ignore"):
-        outputs = weight * problem.predict(moved.reshape(-1, places.shape[1]))[:, rows]
-    outputs = outputs.reshape(len(places), len(linear) + 1, rows.size)
+        outputs = weight * problem.predict(moved.reshape(-1, points.shape[1]))[:, rows]
+    outputs = outputs.reshape(len(points), len(linear) + 1, rows.size)
     measured = weight * evaluator.measured[rows]
-    for place, values in zip(places, outputs, strict=True):
+    for point, values in zip(points, outputs, strict=True):
         if np.isfinite(values).all():
             base, columns = values[0], (values[1:] - values[0]).T / moves
-            place[linear] += np.linalg.lstsq(columns, measured - base, rcond=RANK_TOLERANCE)[0]
+            point[linear] += np.linalg.lstsq(columns, measured - base, rcond=RANK_TOLERANCE)[0]
     lower, upper = evaluator.lower[linear], evaluator.upper[linear]
-    places[:, linear] = np.clip(places[:, linear], lower, upper)
+    points[:, linear] = np.clip(points[:, linear], lower, upper)

@@ -27,21 +27,21 @@ def assess_search(
     state: RunState,
     rms: float,
     tests: ResidualTests | None,
-    found: FoundMinima,
+    minima: FoundMinima,
 ) -> SearchEvidence:
     """Assess the evidence that the estimate, with its RMS and residual tests, is the best."""
     restarts = count_restarts(*state.champions_and_counters)
     because: Literal["starts", "residuals"] | None = None
-    if found.agreeing >= _ENOUGH_STARTS:
+    if minima.agreeing >= _ENOUGH_STARTS:
         because = "starts"
     elif is_explained(problem, rms, tests):
         because = "residuals"
     return SearchEvidence(
         because is not None,
         because,
-        restarts.independent + found.projected,
-        found.agreeing,
-        found.minima,
+        restarts.independent + minima.projected,
+        minima.agreeing,
+        minima.minima,
     )
 
 

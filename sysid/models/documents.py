@@ -111,8 +111,8 @@ def _describe_yaml_error(error: yaml.YAMLError) -> str:
         problem += "; put an expression with commas or brackets in quotes"
     elif match := _FOREIGN_START.search(problem):
         problem = f"a text cannot begin with {match[1]}; put it in quotes, such as '{match[1]}'"
-    place = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}: "
-    return f"the YAML cannot be read: {place}{' '.join(problem.split())}"
+    position = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}: "
+    return f"the YAML cannot be read: {position}{' '.join(problem.split())}"
 
 
 _SHORT_REPR = Repr()
@@ -137,10 +137,10 @@ class DocumentReader:
         self._faults: list[Fault] = []
         self._expression_characters = 0
 
-    def add_fault(self, place: str, detail: str, column: int | None = None) -> None:
-        """Record a fault; `place` is its JSON pointer."""
+    def add_fault(self, pointer: str, detail: str, column: int | None = None) -> None:
+        """Record a fault; `pointer` is where it is."""
         self._faults.append(
-            Fault(_replace_unprintable(place), _replace_unprintable(detail), column)
+            Fault(_replace_unprintable(pointer), _replace_unprintable(detail), column)
         )
 
     def count_faults(self) -> int:
@@ -159,14 +159,14 @@ class DocumentReader:
             raise InvalidModel(self._faults)
 
     def read_section(
-        self, value: object, place: str, allowed: Iterable[str] | None = None, most: int = 256
+        self, value: object, pointer: str, allowed: Iterable[str] | None = None, most: int = 256
     ) -> dict[str, Any]:
         """Read a mapping of names to values; None is an empty one.
 
         Parameters
         ----------
         value : object
-        place : str
+        pointer : str
             JSON pointer of the mapping.
         allowed : iterable of str or None
             Fields that it may have; None: any name.
@@ -176,10 +176,10 @@ class DocumentReader:
         if value is None:
             return {}
         if not isinstance(value, Mapping):
-            self.add_fault(place, f"{quote_value(value)} is not a mapping of names to values")
+            self.add_fault(pointer, f"{quote_value(value)} is not a mapping of names to values")
             return {}
         if len(value) > most:
-            self.add_fault(place, f"has {len(value)} entries; at most {most} are allowed")
+            self.add_fault(pointer, f"has {len(value)} entries; at most {most} are allowed")
             return {}
         names = tuple(allowed) if allowed is not None else None
         fields: dict[str, Any] = {}
@@ -189,87 +189,89 @@ class DocumentReader:
                 comma = item is None and isinstance(key, int) and not isinstance(key, bool)
                 meant = f", or write 0.{key} where 0,{key} was meant" if comma else ""
                 self.add_fault(
-                    place, f"the key {quote_value(key)} is not a text; put it in quotes{meant}"
+                    pointer, f"the key {quote_value(key)} is not a text; put it in quotes{meant}"
                 )
             elif item is None and key.count(")") > key.count("("):
                 # YAML reads {x: max(a, b)} as x: max(a and a key b) without a value
                 self.add_fault(
-                    place,
+                    pointer,
                     f"the comma before {quote_value(key)} ends a value in braces; "
                     "put the expression in quotes, such as {x: 'max(a, b)'}",
                 )
             elif names is not None and key not in names:
                 self.add_fault(
-                    place + join_pointer(key[:80]), f"unknown field{suggest_name(key, names)}"
+                    pointer + join_pointer(key[:80]), f"unknown field{suggest_name(key, names)}"
                 )
             else:
                 fields[key] = item
         return fields
 
-    def require_field(self, fields: Mapping[str, Any], name: str, place: str, what: str) -> Any:
+    def require_field(self, fields: Mapping[str, Any], name: str, pointer: str, what: str) -> Any:
         """Return a required field; None, with a fault, if it is missing."""
         if fields.get(name) is None:
-            self.add_fault(place + join_pointer(name), f"is missing; {what}")
+            self.add_fault(pointer + join_pointer(name), f"is missing; {what}")
         return fields.get(name)
 
-    def read_number(self, value: object, place: str, default: float = 0.0) -> float:
+    def read_number(self, value: object, pointer: str, default: float = 0.0) -> float:
         """Read a finite number."""
         if isinstance(value, bool) or not isinstance(value, int | float):
-            self.add_fault(place, f"{quote_value(value)} is not a number")
+            self.add_fault(pointer, f"{quote_value(value)} is not a number")
             return default
         if not -1e300 < value < 1e300:
-            self.add_fault(place, f"{quote_value(value)} is not a finite number")
+            self.add_fault(pointer, f"{quote_value(value)} is not a finite number")
             return default
         return float(value)
 
-    def read_whole_number(self, value: object, place: str, low: int, high: int) -> int:
+    def read_whole_number(self, value: object, pointer: str, low: int, high: int) -> int:
         """Read a whole number from `low` to `high`."""
-        number = self.read_number(value, place, float(low)) if not isinstance(value, int) else value
+        number = (
+            self.read_number(value, pointer, float(low)) if not isinstance(value, int) else value
+        )
         if isinstance(number, bool) or number != int(number) or not low <= number <= high:
             self.add_fault(
-                place, f"{quote_value(value)} is not a whole number from {low} to {high}"
+                pointer, f"{quote_value(value)} is not a whole number from {low} to {high}"
             )
             return low
         return int(number)
 
-    def read_text(self, value: object, place: str, default: str = "", most: int = 4000) -> str:
+    def read_text(self, value: object, pointer: str, default: str = "", most: int = 4000) -> str:
         """Read a text of at most `most` characters; None is the default."""
         if value is None:
             return default
         if not isinstance(value, str):
-            self.add_fault(place, f"{quote_value(value)} is not a text")
+            self.add_fault(pointer, f"{quote_value(value)} is not a text")
             return default
         if len(value) > most:
-            self.add_fault(place, f"has {len(value)} characters; at most {most} are allowed")
+            self.add_fault(pointer, f"has {len(value)} characters; at most {most} are allowed")
             return default
         return " ".join(value.split())
 
-    def read_unit(self, value: object, place: str) -> str:
+    def read_unit(self, value: object, pointer: str) -> str:
         """Read a unit symbol; ``1`` for none."""
         if value is None or (value == 1 and not isinstance(value, bool)):
             return "1"
-        return self.read_text(value, place, "1", 40) or "1"
+        return self.read_text(value, pointer, "1", 40) or "1"
 
-    def read_choice(self, value: object, options: tuple[str, ...], place: str) -> str:
+    def read_choice(self, value: object, options: tuple[str, ...], pointer: str) -> str:
         """Read one of some words; the first, with a fault, if it is none of them."""
         if isinstance(value, str) and value in options:
             return value
         quoted = ", ".join(repr(option) for option in options)
         hint = suggest_name(value, options) if isinstance(value, str) else ""
         hint = hint if hint.startswith("; did") else ""
-        self.add_fault(place, f"{quote_value(value)} is not one of {quoted}{hint}")
+        self.add_fault(pointer, f"{quote_value(value)} is not one of {quoted}{hint}")
         return options[0]
 
-    def read_expression(self, value: object, place: str) -> str:
+    def read_expression(self, value: object, pointer: str) -> str:
         """Read the text of an expression; a bare number is one, too.
 
         Beyond `MAX_EXPRESSION_CHARACTERS` of the whole document, texts count as 0.
         """
         if isinstance(value, int | float) and not isinstance(value, bool):
-            return repr(self.read_number(value, place))
+            return repr(self.read_number(value, pointer))
         if not isinstance(value, str):
             self.add_fault(
-                place, f"{quote_value(value)} is not an expression; write a text such as 'a*x'"
+                pointer, f"{quote_value(value)} is not an expression; write a text such as 'a*x'"
             )
             return "0"
         before = self._expression_characters
@@ -278,7 +280,7 @@ class DocumentReader:
             return value
         if before <= MAX_EXPRESSION_CHARACTERS:
             self.add_fault(
-                place,
+                pointer,
                 "from here on, the expressions of the model have more than "
                 f"{MAX_EXPRESSION_CHARACTERS} characters together; write fewer or shorter ones",
             )

@@ -39,15 +39,15 @@ def read_equations(
             reader.add_fault(join_pointer("equations", name), detail)
     texts, trees = {}, []
     for state in scope.states:
-        place = join_pointer("equations", state)
+        pointer = join_pointer("equations", state)
         if fields.get(state) is None:
             reader.add_fault(
-                place, f"is missing; every state needs its equation, {_describe_form(scope)}"
+                pointer, f"is missing; every state needs its equation, {_describe_form(scope)}"
             )
             continue
-        texts[state] = reader.read_expression(fields[state], place)
+        texts[state] = reader.read_expression(fields[state], pointer)
         checked = check_expression(texts[state], scope)
-        add_faults(reader, checked, place)
+        add_faults(reader, checked, pointer)
         _check_own_present(reader, checked, state, scope)
         trees.append(checked.tree or _ZERO)
     return texts, tuple(trees)
@@ -59,10 +59,10 @@ def _find_derived_state(name: str) -> str | None:
     return next(filter(None, match.groups()), None) if match else None
 
 
-def add_faults(reader: DocumentReader, checked: CheckedExpression, place: str) -> None:
+def add_faults(reader: DocumentReader, checked: CheckedExpression, pointer: str) -> None:
     """Add the faults of an expression to the reader."""
     for column, detail in checked.faults:
-        reader.add_fault(place, detail, column)
+        reader.add_fault(pointer, detail, column)
 
 
 def read_outputs(
@@ -75,9 +75,10 @@ def read_outputs(
     units = {state.name: state.unit for state in states}
     texts, outputs = [], []
     for name, entry in fields.items():
-        place = join_pointer("outputs", name)
-        written = _read_output_text(reader, entry, place)
-        pointer = place + "/expression" if isinstance(entry, Mapping) else place
+        entry_pointer = join_pointer("outputs", name)
+        written = _read_output_text(reader, entry, entry_pointer)
+        part = "/expression" if isinstance(entry, Mapping) else ""
+        pointer = entry_pointer + part
         checked = check_expression(written.expression, scope)
         add_faults(reader, checked, pointer)
         tree = checked.tree or _ZERO
@@ -87,7 +88,7 @@ def read_outputs(
     return tuple(texts), tuple(outputs)
 
 
-def check_size(reader: DocumentReader, trees: Iterable[Expression], place: str) -> None:
+def check_size(reader: DocumentReader, trees: Iterable[Expression], pointer: str) -> None:
     """Add a fault if the trees of a model have more nodes together than are compiled."""
     nodes = sum(1 for tree in trees for _ in walk(tree))
     if nodes > MAX_NODES:
@@ -95,7 +96,7 @@ def check_size(reader: DocumentReader, trees: Iterable[Expression], place: str) 
             f"the model has {nodes} numbers, names, operators and functions; at most {MAX_NODES} "
             "are compiled. Write fewer or shorter expressions"
         )
-        reader.add_fault(place, detail)
+        reader.add_fault(pointer, detail)
 
 
 def order_states(
@@ -155,11 +156,13 @@ def _check_own_present(
             reader.add_fault(join_pointer("equations", state), detail, column)
 
 
-def _read_output_text(reader: DocumentReader, entry: object, place: str) -> OutputText:
+def _read_output_text(reader: DocumentReader, entry: object, pointer: str) -> OutputText:
     if not isinstance(entry, Mapping):
-        return OutputText(reader.read_expression(entry, place), None)
-    fields = reader.read_section(entry, place, ("expression", "unit"))
-    reader.require_field(fields, "expression", place, "say what is measured, such as x")
-    expression = reader.read_expression(fields.get("expression", "0"), place + "/expression")
+        return OutputText(reader.read_expression(entry, pointer), None)
+    fields = reader.read_section(entry, pointer, ("expression", "unit"))
+    reader.require_field(fields, "expression", pointer, "say what is measured, such as x")
+    expression = reader.read_expression(fields.get("expression", "0"), pointer + "/expression")
     unit = fields.get("unit")
-    return OutputText(expression, None if unit is None else reader.read_unit(unit, place + "/unit"))
+    return OutputText(
+        expression, None if unit is None else reader.read_unit(unit, pointer + "/unit")
+    )

@@ -45,12 +45,12 @@ def read_histories(
 
 
 def _read_function(reader: DocumentReader, value: object, state: str, scope: Scope) -> Expression:
-    place = join_pointer("history", state)
-    checked = check_expression(reader.read_expression(value, place), scope)
-    add_faults(reader, checked, place)
+    pointer = join_pointer("history", state)
+    checked = check_expression(reader.read_expression(value, pointer), scope)
+    add_faults(reader, checked, pointer)
     for signal, column in checked.uses:
         detail = f"a history does not depend on {signal.name!r}; write a function of t"
-        reader.add_fault(place, detail, column)
+        reader.add_fault(pointer, detail, column)
     return checked.tree or Number(0.0)
 
 
@@ -67,17 +67,17 @@ def derive_starts(
 def _derive_start(
     reader: DocumentReader, state: str, start: InitialState, trees: Mapping[str, Expression]
 ) -> InitialState:
-    place = join_pointer("initial", state)
+    pointer = join_pointer("initial", state)
     text = start.text if isinstance(start, DerivedInitial) else ""
     if text == STEADY and trees:
         detail = (
             f"a steady start has been at rest, but /history says what {next(iter(trees))!r} did"
         )
-        reader.add_fault(place, f"{detail}; leave one of them out")
+        reader.add_fault(pointer, f"{detail}; leave one of them out")
     if state not in trees:
         if text == HISTORY:
             detail = f"there is no history of {state!r}; write one, history: {{{state}: …}}"
-            reader.add_fault(place, detail)
+            reader.add_fault(pointer, detail)
         return start
     end = substitute(trees[state], _stop_clock)
     if isinstance(start, DerivedInitial) and text == HISTORY:
@@ -91,7 +91,7 @@ def _derive_start(
             f"the state starts at {value:g}, but its history ends at {format_expression(end)}; "
             "leave the start out, or give {lower, upper}, measured or an expression of parameters"
         )
-        reader.add_fault(place, detail)
+        reader.add_fault(pointer, detail)
     return start
 
 

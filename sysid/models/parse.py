@@ -114,9 +114,9 @@ def keep_terms(model: Model, labels: Sequence[str]) -> Model:
 def _check_size(reader: DocumentReader, model: Model) -> None:
     starts = (start.expression for start in model.initial if isinstance(start, DerivedInitial))
     outputs = (output.expression for output in model.outputs)
-    place = "/terms" if model.form == "polynomial" else "/equations"
+    pointer = "/terms" if model.form == "polynomial" else "/equations"
     histories = (history.expression for history in model.histories)
-    equations.check_size(reader, (*model.equations, *outputs, *starts, *histories), place)
+    equations.check_size(reader, (*model.equations, *outputs, *starts, *histories), pointer)
 
 
 def _check_bounds_rules(reader: DocumentReader, model: Model) -> None:
@@ -124,18 +124,20 @@ def _check_bounds_rules(reader: DocumentReader, model: Model) -> None:
     if model.form == "differential":
         return
     starts = zip(model.states, model.initial, strict=True)
-    places = [join_pointer("parameters", p.name) for p in model.parameters if p.bounds is not None]
-    places += [
+    pointers = [
+        join_pointer("parameters", p.name) for p in model.parameters if p.bounds is not None
+    ]
+    pointers += [
         join_pointer("initial", state.name)
         for state, start in starts
         if isinstance(start, EstimatedInitial) and start.bounds is not None
     ]
-    for place in places:
-        reader.add_fault(place + "/bounds", "belongs to the differential form; give numbers")
+    for pointer in pointers:
+        reader.add_fault(pointer + "/bounds", "belongs to the differential form; give numbers")
 
 
 def _read_form(reader: DocumentReader, document: Mapping[str, Any]) -> ModelForm:
-    """Read the form. A wrong one is guessed from the fields, so that their faults are told too."""
+    """Read the form. A wrong one is guessed from the fields, so that their faults are found too."""
     form = reader.require_field(document, "form", "", f"it is one of {', '.join(_FORMS)}")
     if form is not None:
         reader.read_choice(form, _FORMS, "/form")
@@ -234,8 +236,8 @@ def _solve_steady_starts(
             f"{', '.join(steady)} cannot start steady: {error}. Give a number, "
             "{lower, upper}, measured, or an expression such as K*u0"
         )
-        place = "/initial" if len(steady) > 1 else join_pointer("initial", *steady)
-        reader.add_fault(place, detail)
+        pointer = "/initial" if len(steady) > 1 else join_pointer("initial", *steady)
+        reader.add_fault(pointer, detail)
         reader.raise_faults()
     return tuple(
         replace(start, expression=rest[name])

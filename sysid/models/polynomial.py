@@ -141,9 +141,9 @@ def _wants_constant(reader: DocumentReader, fields: Mapping[str, Any]) -> bool:
     return _read_flag(reader, fields.get("constant", False), "/constant")
 
 
-def _read_flag(reader: DocumentReader, value: object, place: str) -> bool:
+def _read_flag(reader: DocumentReader, value: object, pointer: str) -> bool:
     if not isinstance(value, bool):
-        reader.add_fault(place, f"{quote_value(value)} is not true or false")
+        reader.add_fault(pointer, f"{quote_value(value)} is not true or false")
     return value is True
 
 
@@ -194,16 +194,16 @@ def _read_regressors(
     )
     regressors: list[PastValue] = []
     for name, entries in reader.read_section(lags, "/lags").items():
-        place = join_pointer("lags", name)
+        pointer = join_pointer("lags", name)
         if name not in scope.signals:
-            reader.add_fault(place, f"there is no such signal{suggest_name(name, scope.signals)}")
+            reader.add_fault(pointer, f"there is no such signal{suggest_name(name, scope.signals)}")
         elif not isinstance(entries, list | tuple) or not entries:
-            reader.add_fault(place, f"{quote_value(entries)} is not a list of lags in samples")
+            reader.add_fault(pointer, f"{quote_value(entries)} is not a list of lags in samples")
         else:
             regressors += [
                 value
                 for number, entry in enumerate(entries)
-                if (value := _read_regressor(reader, name, entry, f"{place}/{number}", scope))
+                if (value := _read_regressor(reader, name, entry, f"{pointer}/{number}", scope))
             ]
     for number, value in enumerate(regressors):
         if value in regressors[:number]:
@@ -214,35 +214,35 @@ def _read_regressors(
 
 
 def _read_regressor(
-    reader: DocumentReader, name: str, entry: object, place: str, scope: Scope
+    reader: DocumentReader, name: str, entry: object, pointer: str, scope: Scope
 ) -> PastValue | None:
     faults_before = reader.count_faults()
     parameter_scope = replace(scope, states=(), inputs=())
-    checked = check_expression(reader.read_expression(entry, place), parameter_scope)
-    add_faults(reader, checked, place)
+    checked = check_expression(reader.read_expression(entry, pointer), parameter_scope)
+    add_faults(reader, checked, pointer)
     for value, column in checked.uses:  # of an intermediate name
         detail = f"the lag depends on {value.name!r}; it consists of parameters and constants only"
-        reader.add_fault(place, detail, column)
+        reader.add_fault(pointer, detail, column)
     if reader.count_faults() > faults_before or checked.tree is None:
         return None
     index = split_index(Binary("-", Symbol("k", "index"), checked.tree), scope)
     if isinstance(index, str):
-        reader.add_fault(place, index)
+        reader.add_fault(pointer, index)
         return None
     value = PastValue(name, "state" if name in scope.states else "input", *index)
-    return _reject_present(reader, value, place)
+    return _reject_present(reader, value, pointer)
 
 
-def _reject_present(reader: DocumentReader, value: PastValue, place: str) -> PastValue | None:
+def _reject_present(reader: DocumentReader, value: PastValue, pointer: str) -> PastValue | None:
     if has_varying_delay(value):
-        reader.add_fault(place, "the lags of a polynomial do not change with inputs")
+        reader.add_fault(pointer, "the lags of a polynomial do not change with inputs")
         return None
     if value.kind == "state" and value.offset == 0:
         detail = (
             f"{format_expression(value)} may reach the present {value.name}(k); "
             "need a lag of 1 or more"
         )
-        reader.add_fault(place, detail)
+        reader.add_fault(pointer, detail)
         return None
     return value
 
@@ -256,19 +256,19 @@ def _read_listed_terms(
     if len(written) > most:
         reader.add_fault(where, f"has {len(written)} terms; at most {most} are allowed")
     for number, entry in enumerate(written[:most]):
-        place, faults_before = f"{where}/{number}", reader.count_faults()
-        checked = check_expression(reader.read_expression(entry, place), scope)
-        add_faults(reader, checked, place)
+        pointer, faults_before = f"{where}/{number}", reader.count_faults()
+        checked = check_expression(reader.read_expression(entry, pointer), scope)
+        add_faults(reader, checked, pointer)
         if checked.tree is None or reader.count_faults() > faults_before:
             continue
         factors = _split_factors(checked.tree)
         term = Term(_sort_factors(factors or ()))
         if factors is None:
             detail = "a term is a product of past values, such as y(k-1)*u(k-1-dk)**2"
-            reader.add_fault(place, detail)
+            reader.add_fault(pointer, detail)
         elif (label := term.label) in terms:
-            reader.add_fault(place, f"{label} is listed twice")
-        elif all(_reject_present(reader, value, place) for value in factors):
+            reader.add_fault(pointer, f"{label} is listed twice")
+        elif all(_reject_present(reader, value, pointer) for value in factors):
             terms[label] = term
     return tuple(terms.values())
 

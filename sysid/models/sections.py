@@ -63,22 +63,24 @@ def check_names(
     words = list_reserved_names(form)
     for section, names in sections.items():
         for name in names:
-            place = join_pointer(section, name)
+            pointer = join_pointer(section, name)
             if not _NAME.fullmatch(name):
                 need = "need letters, digits and _, not starting with a digit, at most 64 of them"
-                reader.add_fault(place, f"{quote_value(name)} cannot be a name; {need}")
+                reader.add_fault(pointer, f"{quote_value(name)} cannot be a name; {need}")
             elif name in words:
-                reader.add_fault(place, f"{name!r} is a word of the language; choose another name")
+                reader.add_fault(
+                    pointer, f"{name!r} is a word of the language; choose another name"
+                )
             elif name in taken:
-                reader.add_fault(place, f"{name!r} is already declared in /{taken[name]}")
+                reader.add_fault(pointer, f"{name!r} is already declared in /{taken[name]}")
             taken.setdefault(name, section)
 
 
-def read_signals(reader: DocumentReader, value: object, place: str) -> tuple[ModelSignal, ...]:
+def read_signals(reader: DocumentReader, value: object, pointer: str) -> tuple[ModelSignal, ...]:
     """Read signals with their units: ``{q: N}``."""
-    fields = reader.read_section(value, place, most=MAX_EQUATIONS)
+    fields = reader.read_section(value, pointer, most=MAX_EQUATIONS)
     return tuple(
-        ModelSignal(k, reader.read_unit(v, place + join_pointer(k))) for k, v in fields.items()
+        ModelSignal(k, reader.read_unit(v, pointer + join_pointer(k))) for k, v in fields.items()
     )
 
 
@@ -96,27 +98,27 @@ def read_parameters(reader: DocumentReader, value: object) -> tuple[Parameter, .
 
 
 def _read_parameter(reader: DocumentReader, name: str, entry: object) -> Parameter | None:
-    place, faults_before = join_pointer("parameters", name), reader.count_faults()
-    fields = reader.read_section(entry, place, _PARAMETER_FIELDS)
+    pointer, faults_before = join_pointer("parameters", name), reader.count_faults()
+    fields = reader.read_section(entry, pointer, _PARAMETER_FIELDS)
     if isinstance(entry, Mapping) or entry is None:
         for bound in ("lower", "upper"):
-            reader.require_field(fields, bound, place, "give the interval in which to search")
+            reader.require_field(fields, bound, pointer, "give the interval in which to search")
     numbers = {
-        key: reader.read_number(fields[key], place + join_pointer(key))
+        key: reader.read_number(fields[key], pointer + join_pointer(key))
         for key in ("lower", "upper", "fixed")
         if fields.get(key) is not None
     }
-    unit = reader.read_unit(fields.get("unit"), place + "/unit")
+    unit = reader.read_unit(fields.get("unit"), pointer + "/unit")
     scale = reader.read_choice(
-        fields.get("scale", "linear"), get_args(ParameterScale), place + "/scale"
+        fields.get("scale", "linear"), get_args(ParameterScale), pointer + "/scale"
     )
-    reader.read_text(fields.get("description"), place + "/description")
-    tied = reader.read_text(fields.get("tied"), place + "/tied") or None
+    reader.read_text(fields.get("description"), pointer + "/description")
+    tied = reader.read_text(fields.get("tied"), pointer + "/tied") or None
     if tied is not None and "fixed" in numbers:
         reader.add_fault(
-            place + "/tied", "a parameter is either fixed or tied; leave one of them out"
+            pointer + "/tied", "a parameter is either fixed or tied; leave one of them out"
         )
-    bounds = _read_bounds_rule(reader, fields, place)
+    bounds = _read_bounds_rule(reader, fields, pointer)
     if reader.count_faults() > faults_before:
         return None
     try:
@@ -124,17 +126,17 @@ def _read_parameter(reader: DocumentReader, name: str, entry: object) -> Paramet
             name, unit=unit, scale=cast(ParameterScale, scale), tied=tied, bounds=bounds, **numbers
         )
     except InvalidBounds as error:
-        reader.add_fault(place, str(error))
+        reader.add_fault(pointer, str(error))
         return None
 
 
 def _read_bounds_rule(
-    reader: DocumentReader, fields: Mapping[str, Any], place: str
+    reader: DocumentReader, fields: Mapping[str, Any], pointer: str
 ) -> BoundsRule | None:
     """Read what a parameter is, if its bounds follow the data."""
     if fields.get("bounds") is None:
         return None
-    rule = reader.read_choice(fields["bounds"], get_args(BoundsRule), place + "/bounds")
+    rule = reader.read_choice(fields["bounds"], get_args(BoundsRule), pointer + "/bounds")
     return cast(BoundsRule, rule)
 
 
@@ -175,48 +177,50 @@ def read_initial_states(
 
 
 def _read_initial_state(
-    reader: DocumentReader, value: object, place: str, scope: Scope
+    reader: DocumentReader, value: object, pointer: str, scope: Scope
 ) -> InitialState:
     if value == "measured":
         return MeasuredInitial()
     if isinstance(value, str):
         text = " ".join(value.split())
         return DerivedInitial(
-            Number(0.0) if text in (STEADY, HISTORY) else _read_start(reader, text, place, scope),
+            Number(0.0) if text in (STEADY, HISTORY) else _read_start(reader, text, pointer, scope),
             text,
         )
     if isinstance(value, Mapping):
-        fields = reader.read_section(value, place, ("lower", "upper", "bounds"))
+        fields = reader.read_section(value, pointer, ("lower", "upper", "bounds"))
         for bound in ("lower", "upper"):
             reader.require_field(
-                fields, bound, place, "an estimated initial state needs both bounds"
+                fields, bound, pointer, "an estimated initial state needs both bounds"
             )
-        lower, upper = (reader.read_number(fields.get(b) or 0.0, place) for b in ("lower", "upper"))
+        lower, upper = (
+            reader.read_number(fields.get(b) or 0.0, pointer) for b in ("lower", "upper")
+        )
         if {"lower", "upper"} <= fields.keys() and not lower < upper:
-            reader.add_fault(place, f"has bounds [{lower:g}, {upper:g}]; need lower < upper")
-        return EstimatedInitial(lower, upper, _read_bounds_rule(reader, fields, place))
+            reader.add_fault(pointer, f"has bounds [{lower:g}, {upper:g}]; need lower < upper")
+        return EstimatedInitial(lower, upper, _read_bounds_rule(reader, fields, pointer))
     if isinstance(value, bool) or not isinstance(value, int | float):
-        reader.add_fault(place, f"{quote_value(value)} is not an initial state; {_NEED_START}")
+        reader.add_fault(pointer, f"{quote_value(value)} is not an initial state; {_NEED_START}")
         return FixedInitial(0.0)
-    return FixedInitial(reader.read_number(value, place))
+    return FixedInitial(reader.read_number(value, pointer))
 
 
-def _read_start(reader: DocumentReader, text: str, place: str, scope: Scope) -> Expression:
+def _read_start(reader: DocumentReader, text: str, pointer: str, scope: Scope) -> Expression:
     """Read the expression of a start; an input u has its first value, which is also ``u0``."""
     declared = (*scope.names, *scope.states)
     first_values = {f"{name}0": name for name in scope.inputs if f"{name}0" not in declared}
     inputs = (*scope.inputs, *first_values)
     if _NAME.fullmatch(text) and text not in (*scope.names, *inputs):
-        reader.add_fault(place, f"{quote_value(text)} is not an initial state; {_NEED_START}")
+        reader.add_fault(pointer, f"{quote_value(text)} is not an initial state; {_NEED_START}")
         return Number(0.0)
     checked = check_expression(text, replace(scope, states=(), inputs=inputs))
     for column, detail in checked.faults:
-        reader.add_fault(place, detail, column)
-    _check_start_uses(reader, checked.uses, place)
+        reader.add_fault(pointer, detail, column)
+    _check_start_uses(reader, checked.uses, pointer)
     tree = checked.tree or Number(0.0)
     for node in walk(tree):
         if isinstance(node, Symbol) and node.kind in ("time", "index"):
-            reader.add_fault(place, f"a start does not depend on {node.name}")
+            reader.add_fault(pointer, f"a start does not depend on {node.name}")
 
     def find_input(node: Expression) -> Expression | None:
         is_first = isinstance(node, PastValue) and node.name in first_values
@@ -225,15 +229,15 @@ def _read_start(reader: DocumentReader, text: str, place: str, scope: Scope) -> 
     return substitute(tree, find_input)
 
 
-def _check_start_uses(reader: DocumentReader, uses: Sequence[SignalUse], place: str) -> None:
+def _check_start_uses(reader: DocumentReader, uses: Sequence[SignalUse], pointer: str) -> None:
     """Check that a start reads first values of inputs only; intermediate names may read others."""
     for value, column in uses:
         if value.kind == "state":
             detail = f"a start does not depend on a state such as {value.name!r}"
-            reader.add_fault(place, detail, column)
+            reader.add_fault(pointer, detail, column)
         elif value.offset or value.delay is not None:
             detail = f"a start has no past; write {value.name.removesuffix('0')}0, its first value"
-            reader.add_fault(place, detail, column)
+            reader.add_fault(pointer, detail, column)
 
 
 def read_solver(reader: DocumentReader, value: object, form: ModelForm) -> Solver:

@@ -63,8 +63,8 @@ def check_delay_units(reader: DocumentReader, model: Model) -> None:
                 text = format_expression(to_expression({factors: 1.0}), "t")
                 detail = _describe_delay_unit(text, unit or "", size, form, in_periods=in_periods)
                 name = _find_quantity(factors[0][0])
-                place = ("inputs", name) if name in inputs else ("parameters", name, "unit")
-                reader.add_fault(join_pointer(*place), detail)
+                parts = ("inputs", name) if name in inputs else ("parameters", name, "unit")
+                reader.add_fault(join_pointer(*parts), detail)
 
 
 def _find_bare_delays(past: PastValue) -> Iterator[tuple[Monomial, bool]]:

@@ -1,4 +1,4 @@
-"""What a model declares and does not use; a check tells it."""
+"""What a model declares and does not use; a check reports it."""
 
 from collections.abc import Iterator, Mapping
 

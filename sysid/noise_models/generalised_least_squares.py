@@ -103,8 +103,8 @@ def fit_generalised_least_squares(
     search = WhitenedLeastSquares(problem, 2**62 if max_simulations is None else max_simulations)
     if search.simulations_left < 1:
         return GeneralisedEstimate(theta, {}, 0, False)
-    place = to_unit(problem.evaluator, theta[None])[0]
-    error = search.compute_residuals(place[None])[0]
+    point = to_unit(problem.evaluator, theta[None])[0]
+    error = search.compute_residuals(point[None])[0]
     coloured = select_coloured_outputs(problem, error)
     times: Mapping[str, float] = {}
     random = make_move_generator(seed)
@@ -116,18 +116,18 @@ def fit_generalised_least_squares(
             break
         if is_last:
             spread = _factor_output_covariance(
-                search.compute_slopes(place, error), error, make_whitening(problem, times)
+                search.compute_slopes(point, error), error, make_whitening(problem, times)
             )
             new_times = estimate_correlation_times(problem, coloured, error, spread)
         times, whitening = new_times, make_whitening(problem, new_times)
         draws = i == 0 or is_last
-        starts = _draw_starts(search, place, whitening, covariance, random) if draws else []
-        place = search.find_lowest_minimum([place, *starts], whitening)
-        error = search.compute_residuals(place[None])[0]
+        starts = _draw_starts(search, point, whitening, covariance, random) if draws else []
+        point = search.find_lowest_minimum([point, *starts], whitening)
+        error = search.compute_residuals(point[None])[0]
         if is_last:
             break
     if any(times.values()):
-        theta = from_unit(problem.evaluator, place[None])[0]
+        theta = from_unit(problem.evaluator, point[None])[0]
     minima = from_unit(problem.evaluator, search.ends)
     complete = not search.is_cut
     return GeneralisedEstimate(theta, times, search.evaluations, complete, minima, search.rms)
@@ -140,7 +140,7 @@ def select_coloured_outputs(problem: Problem, error: FloatArray) -> set[str]:
 
 def _draw_starts(
     search: "WhitenedLeastSquares",
-    place: FloatArray,
+    point: FloatArray,
     whitening: Whitening,
     covariance: FloatArray,
     random: np.random.Generator,
@@ -151,13 +151,13 @@ def _draw_starts(
         return []
     evaluator = search.problem.evaluator
     moves = _START_DEVIATIONS[np.arange(_N_DRAWN) % _START_DEVIATIONS.size, None]
-    moves = moves * random.standard_normal((_N_DRAWN, place.size)) @ factor_covariance(covariance).T
-    theta = from_unit(evaluator, place[None]) + moves
-    places = to_unit(evaluator, np.clip(theta, evaluator.lower, evaluator.upper))
+    moves = moves * random.standard_normal((_N_DRAWN, point.size)) @ factor_covariance(covariance).T
+    theta = from_unit(evaluator, point[None]) + moves
+    points = to_unit(evaluator, np.clip(theta, evaluator.lower, evaluator.upper))
     with np.errstate(all="ignore"):  # diverged simulations
-        totals = np.sum(np.square(whitening.whiten(search.compute_residuals(places))), axis=1)
+        totals = np.sum(np.square(whitening.whiten(search.compute_residuals(points))), axis=1)
     totals = np.where(np.isfinite(totals), totals, np.inf)
-    return [places[i] for i in np.argsort(totals, kind="stable")[:_MAX_STARTS]]
+    return [points[i] for i in np.argsort(totals, kind="stable")[:_MAX_STARTS]]
 
 
 def _have_converged(times: Mapping[str, float], previous: Mapping[str, float]) -> bool:
@@ -249,16 +249,16 @@ class WhitenedLeastSquares:
         """Simulations that may still be run."""
         return self._budget - self.evaluations
 
-    def compute_residuals(self, places: FloatArray) -> FloatArray:
+    def compute_residuals(self, points: FloatArray) -> FloatArray:
         """Compute weighted residuals (P, n) at points (P, D)."""
-        self.evaluations += places.shape[0]
-        return self.problem.compute_residuals(from_unit(self.problem.evaluator, places))
+        self.evaluations += points.shape[0]
+        return self.problem.compute_residuals(from_unit(self.problem.evaluator, points))
 
-    def compute_slopes(self, place: FloatArray, error: FloatArray) -> FloatArray:
+    def compute_slopes(self, point: FloatArray, error: FloatArray) -> FloatArray:
         """Compute the slopes (n, D) of the residuals."""
-        columns = np.empty((place.size, error.size))
-        fill_jacobian(self._scored, place, error, columns)
-        self.evaluations += place.size
+        columns = np.empty((point.size, error.size))
+        fill_jacobian(self._scored, point, error, columns)
+        self.evaluations += point.size
         return columns.T
 
     def find_lowest_minimum(self, starts: Sequence[FloatArray], whitening: Whitening) -> FloatArray:
@@ -275,6 +275,6 @@ class WhitenedLeastSquares:
             self.evaluations += solution.evaluations
             self.is_cut |= steps < _MAX_STEPS and not solution.is_converged
             solutions.append(solution)
-        self.ends = np.array([solution.place for solution in solutions])
+        self.ends = np.array([solution.point for solution in solutions])
         self.rms = np.sqrt([solution.loss for solution in solutions])
-        return solutions[int(np.argmin(self.rms))].place
+        return solutions[int(np.argmin(self.rms))].point

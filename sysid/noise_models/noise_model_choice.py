@@ -66,13 +66,13 @@ def compare_on_blocks(
     whole = WhitenedLeastSquares(problem, most)
     if most < 2 * sum(_DIVISIONS) * whole.round_simulations:
         return None
-    place = to_unit(problem.evaluator, theta[None])[0]
-    error = whole.compute_residuals(place[None])[0]
+    point = to_unit(problem.evaluator, theta[None])[0]
+    error = whole.compute_residuals(point[None])[0]
     coloured = select_coloured_outputs(problem, error)
     times = estimate_correlation_times(problem, coloured, error, None)
     if not any(times.values()):
         return None
-    generalised = whole.find_lowest_minimum([place], make_whitening(problem, times))
+    generalised = whole.find_lowest_minimum([point], make_whitening(problem, times))
     left, squares, count = most - whole.evaluations, np.zeros(2), 0
     for division in _DIVISIONS:
         blocks = _number_blocks(problem, division)
@@ -80,7 +80,7 @@ def compare_on_blocks(
         for block in range(1, division):
             rows = blocks == block
             part = _leave_out(problem, rows)
-            for i, start in enumerate((place, generalised)):
+            for i, start in enumerate((point, generalised)):
                 search = WhitenedLeastSquares(part, left)
                 if left < search.round_simulations:
                     return None

@@ -43,7 +43,7 @@ class _TimeGrid(NamedTuple):
     """Grid points one period apart: times (N,), and the point of each of n samples."""
 
     times: FloatArray
-    places: IntArray
+    indices: IntArray
     period: float
 
 
@@ -52,7 +52,7 @@ def space_residuals(times: FloatArray, values: FloatArray) -> SpacedResiduals:
     grid = _find_time_grid(np.asarray(times, dtype=np.float64).tobytes())
     if grid is not None:
         spaced, present = np.zeros(grid.times.size), np.zeros(grid.times.size, dtype=np.bool_)
-        spaced[grid.places], present[grid.places] = values, True
+        spaced[grid.indices], present[grid.indices] = values, True
         return SpacedResiduals(grid.times, spaced, present, grid.period, is_regular=True)
     distinct = max(np.unique(times).size - 1, 1)
     spacing = float(times[-1] - times[0]) / distinct
@@ -81,13 +81,13 @@ def _find_time_grid(time_bytes: bytes) -> _TimeGrid | None:
     rounded = np.cumsum(np.maximum(np.rint(steps / period), 0.0))
     period = float((times[-1] - times[0]) / rounded[-1])  # without the rounding error of one step
     exact = np.concatenate([[0.0], steps / period])
-    places = np.concatenate([[0.0], rounded])
+    positions = np.concatenate([[0.0], rounded])
     distance = np.abs(exact - np.rint(exact))
     is_regular = bool(np.all(distance <= _GRID_TOLERANCE) and np.all(np.rint(exact[1:]) >= 1))
-    n = int(places[-1]) + 1
+    n = int(positions[-1]) + 1
     if not (is_regular and times.size >= _MIN_FILLED_SHARE * n):
         return None
-    indices = places.astype(np.intp)
+    indices = positions.astype(np.intp)
     grid_times = times[0] + period * np.arange(n)
     grid_times[indices] = times
     for array in (grid_times, indices):

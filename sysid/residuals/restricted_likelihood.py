@@ -106,9 +106,9 @@ def fit_noise_colour(spaced: SpacedResiduals, columns: FloatArray) -> NoiseColou
 
 
 @jit_compile
-def _to_pole_and_share(place: FloatArray) -> tuple[float, float]:
+def _to_pole_and_share(point: FloatArray) -> tuple[float, float]:
     """Convert the two arguments to the pole and the share of white noise."""
-    return MAX_POLE * np.tanh(place[0]), 1.0 / (1.0 + np.exp(-place[1]))
+    return MAX_POLE * np.tanh(point[0]), 1.0 / (1.0 + np.exp(-point[1]))
 
 
 @jit_compile
@@ -136,10 +136,10 @@ def _whiten_in_place(carried: FloatArray, w: float, columns: FloatArray) -> floa
 
 @jit_compile
 def _compute_innovations(
-    place: FloatArray, series: _ObservedSeries
+    point: FloatArray, series: _ObservedSeries
 ) -> tuple[FloatArray, float, float]:
     """Compute the innovations (n,), their sum of squares, and ln of both determinants."""
-    a, w = _to_pole_and_share(place)
+    a, w = _to_pole_and_share(point)
     n, r = series.basis.shape
     whitened, carried = np.empty((n, r + 1)), np.empty(n - 1)
     for i in range(n):
@@ -192,9 +192,9 @@ def _sum_products(columns: FloatArray) -> FloatArray:
 
 
 @jit_compile
-def _compute_deviance(place: FloatArray, series: _ObservedSeries) -> float:
+def _compute_deviance(point: FloatArray, series: _ObservedSeries) -> float:
     """Compute -2 ln of the restricted likelihood, without a constant."""
-    _, power, determinants = _compute_innovations(place, series)
+    _, power, determinants = _compute_innovations(point, series)
     n, r = series.basis.shape
     deviance: float = (n - r) * np.log(max(power, _TINY)) + determinants
     return deviance
@@ -219,12 +219,12 @@ def _are_white(values: FloatArray) -> bool:
 
 @jit_compile
 def _compute_middle(
-    place: FloatArray, spaced_columns: FloatArray, series: _ObservedSeries
+    point: FloatArray, spaced_columns: FloatArray, series: _ObservedSeries
 ) -> FloatArray:
     """Compute SᵀRS (D, D) from sensitivities (N, D), which are 0 where a sample is missing."""
-    a, w = _to_pole_and_share(place)
+    a, w = _to_pole_and_share(point)
     n, r = series.basis.shape
-    variance = _compute_innovations(place, series)[1] / (n - r)
+    variance = _compute_innovations(point, series)[1] / (n - r)
     size, d = spaced_columns.shape
     past = np.zeros(d)  # Σ aᵏ S(i - k) over k > 0
     gram, lagged = np.zeros((d, d)), np.zeros((d, d))
@@ -241,12 +241,12 @@ def _compute_middle(
     return gram
 
 
-def _estimate_covariance(place: FloatArray, series: _ObservedSeries) -> FloatArray:
+def _estimate_covariance(point: FloatArray, series: _ObservedSeries) -> FloatArray:
     """Estimate the covariance (2, 2) of the two arguments by the curvature of the likelihood."""
     first, second = _DIFFERENCE_STEP * np.eye(2)
 
     def evaluate(move: FloatArray) -> float:
-        return 0.5 * _compute_deviance(place + move, series)
+        return 0.5 * _compute_deviance(point + move, series)
 
     centre = evaluate(np.zeros(2))
     mixed = (

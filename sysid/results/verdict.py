@@ -116,7 +116,7 @@ class Evidence:
         """List the free parameters that have one of these statuses."""
         return [estimate.name for estimate in self.free if estimate.status in statuses]
 
-    def tell_reasons(self, status: str) -> str:
+    def describe_reasons(self, status: str) -> str:
         """Tell each free parameter of this status with its value, and the reason, as sentences."""
         return " ".join(
             f"{one.name} = {plain_estimate(one.value, one.stderr, status=one.status)}"
@@ -216,7 +216,7 @@ def _find_misled_run(evidence: Evidence) -> Iterator[Reason]:
             "serious",
             f"{_join(names)} {'differ' if len(names) > 1 else 'differs'} one step ahead",
             "A free run attributes disturbances to the parameters. "
-            f"{evidence.tell_reasons('prediction-dependent')} Use prediction: one-step.",
+            f"{evidence.describe_reasons('prediction-dependent')} Use prediction: one-step.",
         )
 
 
@@ -227,7 +227,7 @@ def _find_other_hold(evidence: Evidence) -> Iterator[Reason]:
         yield Reason(
             "caution",
             f"{_join(names)} {depend} on how an input is read between its samples",
-            f"{evidence.tell_reasons('hold-dependent')} Say how the input moves between its "
+            f"{evidence.describe_reasons('hold-dependent')} Say how the input moves between its "
             "samples: a warning names the option.",
         )
 

@@ -22,7 +22,7 @@ from sysid.search.basin_hopping import (
     is_champion_coloured,
     is_champion_explained,
 )
-from sysid.search.levenberg_marquardt import factor_damped, write_damped_step, write_spread_place
+from sysid.search.levenberg_marquardt import factor_damped, write_damped_step, write_spread_point
 from sysid.search.operators import (
     USE_LOCAL_SEARCH,
     decode,
@@ -63,16 +63,16 @@ def _draw_best_start(
     evaluator: Evaluator, plan: IslandPlan, shape: tuple[int, int], search: SearchRecord
 ) -> FloatArray:
     """Draw random points and return the one that fits the record best up to the horizon."""
-    places, horizon = np.empty(shape), search.horizon
+    points, horizon = np.empty(shape), search.horizon
     for p in range(shape[0]):
         for d in range(shape[1]):
             draw = 1 + p * shape[1] + d
             word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, draw)
-            places[p, d] = to_uniform(word[0])
+            points[p, d] = to_uniform(word[0])
     search.evaluations += shape[0]
-    predicted = predict_partially(evaluator, from_unit(evaluator, places), horizon)
+    predicted = predict_partially(evaluator, from_unit(evaluator, points), horizon)
     fitness = evaluate_partial_fitness(evaluator, plan, predicted, horizon)
-    return np.asarray(places[np.argmin(fitness[: shape[0]])])
+    return np.asarray(points[np.argmin(fitness[: shape[0]])])
 
 
 @jit_compile
@@ -204,23 +204,23 @@ def _finish_part(
 
 
 @compile_borrowing
-def _propose_places(
+def _propose_points(
     plan: IslandPlan, island: IslandArrays, matrix: FloatArray, gradient: FloatArray, base: float
 ) -> FloatArray:
     """Propose steps of several dampings, and probes drawn from the estimate's covariance."""
     point, search = island.point, island.search
-    places = np.empty((N_TRIALS + search.probe_count, point.size))
+    points = np.empty((N_TRIALS + search.probe_count, point.size))
     for t in range(N_TRIALS):
         damping = search.damping * DAMPING_FACTOR ** (t - 1)
-        write_damped_step(matrix, gradient, point, damping, places[t])
+        write_damped_step(matrix, gradient, point, damping, points[t])
     deviation, factor = np.empty(point.size), factor_damped(matrix, gradient, point, 0.0)
-    for t in range(N_TRIALS, places.shape[0]):
+    for t in range(N_TRIALS, points.shape[0]):
         for d in range(point.size):
             draw = 1 + t * point.size + d
             word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, draw)
             deviation[d] = base * 10.0 ** (1.5 - 2.5 * to_uniform(word[2])) * to_normal(word)
-        write_spread_place(factor, point, deviation, places[t])
-    return places
+        write_spread_point(factor, point, deviation, points[t])
+    return points
 
 
 @compile_borrowing
@@ -232,13 +232,13 @@ def run_adaptive_sequence(evaluator: Evaluator, plan: IslandPlan, island: Island
     search.evaluations += point.size + 1 + N_TRIALS + search.probe_count
     difference = choose_difference(plan, search)
     matrix, gradient, base = build_normal_equations(evaluator, plan, point, horizon, difference)
-    proposals = encode(_propose_places(plan, island, matrix, gradient, base), plan.bits)
-    places = decode(proposals, plan.bits)
+    proposals = encode(_propose_points(plan, island, matrix, gradient, base), plan.bits)
+    points = decode(proposals, plan.bits)
     if horizon < 1.0:
-        predicted = predict_partially(evaluator, from_unit(evaluator, places), horizon)
-        reached = evaluate_partial_fitness(evaluator, plan, predicted, horizon)[: places.shape[0]]
+        predicted = predict_partially(evaluator, from_unit(evaluator, points), horizon)
+        reached = evaluate_partial_fitness(evaluator, plan, predicted, horizon)[: points.shape[0]]
     else:
-        reached = evaluate_population(evaluator, from_unit(evaluator, places))
+        reached = evaluate_population(evaluator, from_unit(evaluator, points))
     best = np.argmin(reached)
     _scatter_population(island, proposals, reached, int(best))
     is_near = reached[best] < FAR_FITNESS * island.fitness[0]
@@ -246,7 +246,7 @@ def run_adaptive_sequence(evaluator: Evaluator, plan: IslandPlan, island: Island
     enough = ENOUGH_GAIN if strict else ENOUGH_PART_GAIN
     if reached[best] < base:
         for d in range(point.size):
-            point[d] = places[best, d]
+            point[d] = points[best, d]
         search.damping *= DAMPING_FACTOR ** float(min(int(best), N_TRIALS) - 2)
         if horizon == 1.0:
             search.reached_fitness = reached[best]

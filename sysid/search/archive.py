@@ -1,6 +1,6 @@
 """Archive of the minima in which the local searches from random points ended.
 
-A minimum is kept with its fitness, its place in [0, 1] and how many searches ended there. Searches
+A minimum is kept with its fitness, its point in [0, 1] and how many searches ended there. Searches
 that begin near the champion return to it, and show nothing. A full archive forgets its worst
 minimum for a better one.
 """
@@ -12,22 +12,22 @@ import numpy as np
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
 
-SAME_PLACE = 1e-3  # of the range: nearer ends are one minimum
+SAME_POINT = 1e-3  # of the range: nearer ends are one minimum
 _SIZE = 16
-_FITNESS, _COUNT, _PLACE = range(3)  # columns; D coordinates follow
+_FITNESS, _COUNT, _POINT = range(3)  # columns; D coordinates follow
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArchivedMinimum:
-    """A minimum: its place (D,) in [0, 1], and how many searches from random points ended there."""
+    """A minimum: its point (D,) in [0, 1], and how many searches from random points ended there."""
 
-    place: FloatArray
+    point: FloatArray
     count: int
 
 
 def make_archive(n: int) -> FloatArray:
     """Make an empty archive for n parameters, shape (16, 2 + n)."""
-    archive = np.zeros((_SIZE, _PLACE + n))
+    archive = np.zeros((_SIZE, _POINT + n))
     archive[:, _FITNESS] = np.inf
     return archive
 
@@ -35,7 +35,7 @@ def make_archive(n: int) -> FloatArray:
 def read_archive(archive: FloatArray) -> list[ArchivedMinimum]:
     """Read the minima of an archive."""
     return [
-        ArchivedMinimum(row[_PLACE:], int(row[_COUNT]))
+        ArchivedMinimum(row[_POINT:], int(row[_COUNT]))
         for row in archive[np.isfinite(archive[:, _FITNESS])]
     ]
 
@@ -46,8 +46,8 @@ def _find_row(archive: FloatArray, point: FloatArray) -> tuple[int, bool]:
     for m in range(archive.shape[0]):
         distance = 0.0
         for d in range(point.size):
-            distance = max(distance, abs(archive[m, _PLACE + d] - point[d]))
-        if distance < SAME_PLACE and np.isfinite(archive[m, _FITNESS]):
+            distance = max(distance, abs(archive[m, _POINT + d] - point[d]))
+        if distance < SAME_POINT and np.isfinite(archive[m, _FITNESS]):
             return m, True
     return int(np.argmax(archive[:, _FITNESS])), False
 
@@ -65,4 +65,4 @@ def archive_end(archive: FloatArray, point: FloatArray, fitness: float) -> None:
     if is_better:
         archive[row, _FITNESS] = fitness
         for d in range(point.size):
-            archive[row, _PLACE + d] = point[d]
+            archive[row, _POINT + d] = point[d]

@@ -21,7 +21,7 @@ import numpy as np
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
 from sysid.kernels.borrowing import compile_borrowing
-from sysid.search.levenberg_marquardt import factor_damped, write_spread_place
+from sysid.search.levenberg_marquardt import factor_damped, write_spread_point
 from sysid.search.operators import (
     USE_LOCAL_SEARCH,
     decode,
@@ -36,10 +36,10 @@ from sysid.search.state import IslandArrays, IslandPlan, SearchRecord
 from sysid.simulation.evaluator import Evaluator, evaluate_population, predict_partially
 from sysid.simulation.scaling import from_unit
 
-LINE_PLACES = 16  # points on a line: one SIMD vector
+LINE_POINTS = 16  # points on a line: one SIMD vector
 LINE_REACH = 5.0  # standard errors to both sides, in a random direction
 _ZOOM_LEVELS = 4  # each examines a fifteenth of the last
-MAX_LINE_SIMULATIONS = _ZOOM_LEVELS * LINE_PLACES
+MAX_LINE_SIMULATIONS = _ZOOM_LEVELS * LINE_POINTS
 _JUMP_REMAINDER = 0.25  # of the difference; a smooth loss leaves less than a tenth
 _HIGH_LOSS = 4.0  # times the loss at the point: jumps to much worse losses do not matter
 
@@ -70,13 +70,13 @@ def _evaluate_line(
     largest_loss: float,
 ) -> FloatArray:
     """Evaluate the squared fitness, limited to `largest_loss`, at equal distances on a line."""
-    places, deviation = np.empty((LINE_PLACES, point.size)), np.empty(point.size)
-    for p in range(LINE_PLACES):
+    points, deviation = np.empty((LINE_POINTS, point.size)), np.empty(point.size)
+    for p in range(LINE_POINTS):
         for d in range(point.size):
-            deviation[d] = (first + (last - first) * p / (LINE_PLACES - 1)) * direction[d]
-        write_spread_place(factor, point, deviation, places[p])
+            deviation[d] = (first + (last - first) * p / (LINE_POINTS - 1)) * direction[d]
+        write_spread_point(factor, point, deviation, points[p])
     return np.minimum(
-        evaluate_population(evaluator, from_unit(evaluator, places)) ** 2, largest_loss
+        evaluate_population(evaluator, from_unit(evaluator, points)) ** 2, largest_loss
     )
 
 
@@ -105,14 +105,14 @@ def has_discontinuity(
     first, width, before, upper_loss = -LINE_REACH, 2.0 * LINE_REACH, 0.0, 0.0
     variance, largest_loss = base**2 / evaluator.n_scored, _HIGH_LOSS * base**2
     for level in range(_ZOOM_LEVELS):
-        search.evaluations += LINE_PLACES
+        search.evaluations += LINE_POINTS
         losses = _evaluate_line(
             evaluator, factor, point, direction, first, first + width, largest_loss
         )
         index, difference = find_odd_increment(losses)
         if difference <= variance or (level > 0 and difference <= _JUMP_REMAINDER * before):
             return False
-        before, width = difference, width / (LINE_PLACES - 1)
+        before, width = difference, width / (LINE_POINTS - 1)
         first += index * width
         upper_loss = max(losses[index], losses[index + 1])
     return bool(upper_loss < largest_loss)
@@ -139,7 +139,7 @@ def hop_from_champion(evaluator: Evaluator, plan: IslandPlan, island: IslandArra
     if search.hop == HOP_IN_ONE_PARAMETER:
         _move_single_parameter(plan, search, matrix, SINGLE_HOP_FACTOR * size, point)
     else:
-        write_spread_place(factor, point, _draw_deviation(plan, search, 0, size, point.size), point)
+        write_spread_point(factor, point, _draw_deviation(plan, search, 0, size, point.size), point)
 
 
 @jit_compile
@@ -217,7 +217,7 @@ def _compute_champion_errors(
 
 @jit_compile
 def _sum_lagged(errors: FloatArray, lag: int) -> float:
-    """Sum the products of residuals (M,) and those `lag` places before them."""
+    """Sum the products of residuals (M,) and those `lag` samples before them."""
     total = 0.0
     for m in range(lag, errors.size):
         total += errors[m] * errors[m - lag]

@@ -49,7 +49,7 @@ from sysid.simulation.scaling import from_unit
 
 
 @jit_compile
-def draw_initial_places(
+def draw_initial_points(
     seed: int, population: int, methods: IntArray, sizes: IntArray, n: int
 ) -> FloatArray:
     """Draw random points (P, D) of all islands; the improved method stratifies them.
@@ -64,7 +64,7 @@ def draw_initial_places(
     methods, sizes : IntArray, shape (I,)
         Method and number of individuals of each island.
     """
-    places, order = np.empty((population, n)), np.arange(population)
+    points, order = np.empty((population, n)), np.arange(population)
     for d in range(n):
         if methods.max() >= METHOD_IMPROVED:
             for i in range(population - 1, 0, -1):
@@ -73,12 +73,12 @@ def draw_initial_places(
         first = 0
         for island in range(sizes.size):
             for p in range(sizes[island]):
-                place = to_uniform(draw_words(seed, USE_INITIAL, island, d, p)[0])
+                position = to_uniform(draw_words(seed, USE_INITIAL, island, d, p)[0])
                 if methods[island] >= METHOD_IMPROVED:
-                    place = (order[first + p] + place) / population
-                places[first + p, d] = place
+                    position = (order[first + p] + position) / population
+                points[first + p, d] = position
             first += sizes[island]
-    return places
+    return points
 
 
 @compile_borrowing
@@ -106,7 +106,7 @@ def breed_simple_children(plan: IslandPlan, island: IslandArrays) -> None:
 @compile_borrowing
 def _breed_child(
     plan: IslandPlan,
-    places: FloatArray,
+    points: FloatArray,
     parents: WordArray,
     generation: int,
     p: int,
@@ -117,7 +117,7 @@ def _breed_child(
     first_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p)
     next_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p + 1)
     first, second = draw_pair(first_word[0], first_word[1], plan.survivors)
-    crossed, third = next_word[0] & 1, to_integer(next_word[1], places.shape[0])
+    crossed, third = next_word[0] & 1, to_integer(next_word[1], points.shape[0])
     cross_over(
         word, parents[first], parents[second], 1 + to_integer(first_word[2], n * bits - 1), bits
     )
@@ -127,22 +127,24 @@ def _breed_child(
         last_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p + 2)
         mutated = to_integer(last_word[0], n)
     for d in range(n):
-        place = word[d] / float((1 << bits) - 1)
+        position = word[d] / float((1 << bits) - 1)
         if not crossed:
             length = 0.4 + 0.6 * to_uniform(first_word[2])
-            place = reflect_at_bounds(places[p, d] + length * (places[first, d] - places[third, d]))
+            position = reflect_at_bounds(
+                points[p, d] + length * (points[first, d] - points[third, d])
+            )
         if d == mutated:
-            place = mutate_by_step(place, last_word[1], last_word[2], bits)
-        word[d] = np.uint32(round(place * float((1 << bits) - 1)))
+            position = mutate_by_step(position, last_word[1], last_word[2], bits)
+        word[d] = np.uint32(round(position * float((1 << bits) - 1)))
 
 
 @compile_borrowing
 def breed_improved_children(plan: IslandPlan, island: IslandArrays) -> WordArray:
     """Breed as many children as there are individuals; they compete with their parents."""
     parents = island.chromosomes
-    children, places = np.empty_like(parents), decode(parents, plan.bits)
+    children, points = np.empty_like(parents), decode(parents, plan.bits)
     for p in range(parents.shape[0]):
-        _breed_child(plan, places, parents, island.search.generation, p, children[p])
+        _breed_child(plan, points, parents, island.search.generation, p, children[p])
     return children
 
 

@@ -44,18 +44,18 @@ def recall_fitness(known: KnownFitness, chromosomes: WordArray, fitness: FloatAr
     """Replace ``nan`` by the fitness of each chromosome (P, D) that is known."""
     for p in range(fitness.size if known.fitness.size else 0):
         if np.isnan(fitness[p]):
-            place, is_same = _locate(chromosomes[p]), True
+            index, is_same = _locate(chromosomes[p]), True
             for d in range(chromosomes.shape[1]):
-                is_same &= known.words[place, d] == chromosomes[p, d]
+                is_same &= known.words[index, d] == chromosomes[p, d]
             if is_same:
-                fitness[p] = known.fitness[place]
+                fitness[p] = known.fitness[index]
 
 
 @compile_borrowing
 def remember_fitness(known: KnownFitness, chromosomes: WordArray, fitness: FloatArray) -> None:
     """Store the fitness (P,) of chromosomes (P, D)."""
     for p in range(fitness.size if known.fitness.size else 0):
-        place = _locate(chromosomes[p])
-        known.fitness[place] = fitness[p]
+        index = _locate(chromosomes[p])
+        known.fitness[index] = fitness[p]
         for d in range(chromosomes.shape[1]):
-            known.words[place, d] = chromosomes[p, d]
+            known.words[index, d] = chromosomes[p, d]

@@ -1,4 +1,4 @@
-"""Bounded least squares on positions in [0, 1], with several damped steps tried in one batch.
+"""Bounded least squares on points in [0, 1], with several damped steps tried in one batch.
 
 The method is Levenberg–Marquardt with Marquardt's scaling [1]_. A parameter at a bound whose slope
 leads outwards is held there. Robust losses use iterative reweighting. Kernels evaluate batches: one
@@ -78,15 +78,15 @@ class _Descent(NamedTuple):
 
     Attributes
     ----------
-    place : FloatArray, shape (D,)
+    point : FloatArray, shape (D,)
     error : FloatArray, shape (n,)
-        Residuals at the place.
+        Residuals at the point.
     columns : FloatArray, shape (D, n)
         Slopes of the residuals.
     progress : _Progress
     """
 
-    place: FloatArray
+    point: FloatArray
     error: FloatArray
     columns: FloatArray
     progress: _Progress
@@ -98,7 +98,7 @@ class LeastSquaresSolution:
 
     Attributes
     ----------
-    place : FloatArray
+    point : FloatArray
         (D,) in [0, 1].
     is_converged : bool
         Whether the next step promises less than the tolerance. False after too many steps, or
@@ -106,12 +106,12 @@ class LeastSquaresSolution:
     evaluations : int
         Simulations run.
     loss : float
-        Loss of the residuals at the place.
+        Loss of the residuals at the point.
     is_cut_short : bool
         Whether the deadline ended the search.
     """
 
-    place: FloatArray
+    point: FloatArray
     is_converged: bool
     evaluations: int
     loss: float
@@ -120,7 +120,7 @@ class LeastSquaresSolution:
 
 def solve_least_squares(
     scored: ScoredSamples,
-    place: FloatArray,
+    point: FloatArray,
     scale: float,
     *,
     steps: int,
@@ -128,7 +128,7 @@ def solve_least_squares(
     tolerance: float = 1e-10,
     is_late: Callable[[], bool] | None = None,
 ) -> LeastSquaresSolution:
-    """Search a local minimum by Levenberg–Marquardt from a place (D,) in [0, 1].
+    """Search a local minimum by Levenberg–Marquardt from a point (D,) in [0, 1].
 
     Parameters
     ----------
@@ -145,14 +145,14 @@ def solve_least_squares(
     """
     progress: Any = np.zeros((), _PROGRESS)
     size, is_cut_short = scored.rows.size, False
-    descent = _Descent(np.array(place), np.empty(size), np.empty((place.size, size)), progress[()])
+    descent = _Descent(np.array(point), np.empty(size), np.empty((point.size, size)), progress[()])
     while steps > 0 and not progress["has_ended"] and not is_cut_short:
         _run_steps(scored, descent, scale, min(steps, at_once), tolerance)
         steps -= at_once
         continues = steps > 0 and not progress["has_ended"]
         is_cut_short = continues and is_late is not None and is_late()
     return LeastSquaresSolution(
-        descent.place,
+        descent.point,
         bool(progress["has_ended"]),
         int(progress["evaluations"]),
         float(progress["loss"]),
@@ -173,9 +173,9 @@ def _run_steps(
     scored: ScoredSamples, descent: _Descent, scale: float, steps: int, tolerance: float
 ) -> None:
     """Take some steps in place."""
-    place, progress = descent.place, descent.progress
+    point, progress = descent.point, descent.progress
     if progress.evaluations == 0:
-        descent.error[:] = compute_residuals(scored, place.reshape((1, place.size)))[0]
+        descent.error[:] = compute_residuals(scored, point.reshape((1, point.size)))[0]
         progress.loss, progress.damping = _sum_loss(descent.error, scale), _FIRST
         progress.evaluations = 1
     for _ in range(steps):
@@ -186,17 +186,17 @@ def _run_steps(
 @compile_borrowing
 def _take_step(scored: ScoredSamples, descent: _Descent, scale: float, tolerance: float) -> None:
     """Take the best of the proposed steps, or increase the damping if none gains."""
-    place, progress = descent.place, descent.progress
+    point, progress = descent.point, descent.progress
     if not progress.has_jacobian:
-        fill_jacobian(scored, place, descent.error, descent.columns)
+        fill_jacobian(scored, point, descent.error, descent.columns)
         progress.has_jacobian = True
-        progress.evaluations += place.size
+        progress.evaluations += point.size
     tried = np.maximum(_DAMPINGS * progress.damping, _MIN_DAMPING)
-    places, promised = _propose_places(descent, tried, scale)
+    points, promised = _propose_points(descent, tried, scale)
     if promised <= tolerance * progress.loss:
         progress.has_ended = True
         return
-    errors = compute_residuals(scored, places)
+    errors = compute_residuals(scored, points)
     progress.evaluations += N_TRIED
     best, value = _find_best(errors, progress.loss, scale)
     if best < 0:
@@ -204,7 +204,7 @@ def _take_step(scored: ScoredSamples, descent: _Descent, scale: float, tolerance
         progress.has_ended = progress.damping > _MAX_DAMPING  # the rest is rounding
         return
     gained = (progress.loss - value) / progress.loss
-    place[:], descent.error[:] = places[best], errors[best]
+    point[:], descent.error[:] = points[best], errors[best]
     progress.loss, progress.has_jacobian = value, False
     damping = tried[best] if best > 0 else progress.damping * 1e-2
     progress.damping = min(max(damping, _MIN_DAMPING), _MAX_DAMPING)
@@ -224,12 +224,12 @@ def _find_best(errors: FloatArray, value: float, scale: float) -> tuple[int, flo
 
 
 @compile_borrowing
-def compute_residuals(scored: ScoredSamples, places: FloatArray) -> FloatArray:
-    """Compute the weighted residuals (P, n) of the scored values at places (P, D)."""
+def compute_residuals(scored: ScoredSamples, points: FloatArray) -> FloatArray:
+    """Compute the weighted residuals (P, n) of the scored values at points (P, D)."""
     evaluator = scored.evaluator
-    predicted = predict_partially(evaluator, from_unit(evaluator, places), 1.0)
-    errors = np.empty((places.shape[0], scored.rows.size))
-    for p in range(places.shape[0]):
+    predicted = predict_partially(evaluator, from_unit(evaluator, points), 1.0)
+    errors = np.empty((points.shape[0], scored.rows.size))
+    for p in range(points.shape[0]):
         for i in range(scored.rows.size):
             row = scored.rows[i]
             errors[p, i] = scored.weight[i] * (predicted[row, p] - evaluator.measured[row])
@@ -251,15 +251,15 @@ def _whiten(ar1_coefficient: FloatArray, errors: FloatArray) -> None:
 
 @compile_borrowing
 def fill_jacobian(
-    scored: ScoredSamples, place: FloatArray, error: FloatArray, columns: FloatArray
+    scored: ScoredSamples, point: FloatArray, error: FloatArray, columns: FloatArray
 ) -> None:
-    """Write the slopes (D, n) of the residuals (n,) at a place (D,); 0 where a neighbour diverges.
+    """Write the slopes (D, n) of the residuals (n,) at a point (D,); 0 where a neighbour diverges.
 
     Forward differences: one batch of D simulations.
     """
-    places, steps = step_aside(place, FINE_DIFFERENCE)
-    errors = compute_residuals(scored, places[1:])
-    for d in range(place.size):
+    points, steps = step_aside(point, FINE_DIFFERENCE)
+    errors = compute_residuals(scored, points[1:])
+    for d in range(point.size):
         for i in range(error.size):
             slope = (errors[d, i] - error[i]) / steps[d]
             columns[d, i] = slope if np.isfinite(slope) else 0.0
@@ -278,14 +278,14 @@ def _sum_loss(error: FloatArray, scale: float) -> float:
 
 
 @compile_borrowing
-def _propose_places(
+def _propose_points(
     descent: _Descent, damping: FloatArray, scale: float
 ) -> tuple[FloatArray, float]:
-    """Propose places (P, D) for dampings (P,); return them and the largest promised gain."""
-    place, promised = descent.place, 0.0
+    """Propose points (P, D) for dampings (P,); return them and the largest promised gain."""
+    point, promised = descent.point, 0.0
     matrix, gradient = form_normal_equations(descent.error, descent.columns, scale)
-    places = np.empty((damping.size, place.size))
+    points = np.empty((damping.size, point.size))
     for p in range(damping.size):
-        gain = write_damped_step(matrix, gradient, place, damping[p], places[p])
+        gain = write_damped_step(matrix, gradient, point, damping[p], points[p])
         promised = max(promised, gain)
-    return places, promised
+    return points, promised

@@ -37,13 +37,13 @@ def step_aside(point: FloatArray, distance: float) -> tuple[FloatArray, FloatArr
     Each neighbour differs in one parameter, away from the nearer bound.
     """
     n = point.size
-    places, steps = np.empty((n + 1, n)), np.empty(n)
+    points, steps = np.empty((n + 1, n)), np.empty(n)
     for d in range(n):
         for p in range(n + 1):
-            places[p, d] = point[d]
+            points[p, d] = point[d]
         steps[d] = distance if point[d] < 0.5 else -distance
-        places[d + 1, d] += steps[d]
-    return places, steps
+        points[d + 1, d] += steps[d]
+    return points, steps
 
 
 @compile_borrowing
@@ -107,9 +107,9 @@ def _solve_transposed(factor: FloatArray, vector: FloatArray) -> None:
 
 
 @jit_compile
-def _move_within_bounds(point: FloatArray, step: FloatArray, place: FloatArray) -> None:
+def _move_within_bounds(point: FloatArray, step: FloatArray, target: FloatArray) -> None:
     for d in range(point.size):
-        place[d] = min(max(point[d] + step[d], 0.0), 1.0)
+        target[d] = min(max(point[d] + step[d], 0.0), 1.0)
 
 
 @compile_borrowing
@@ -128,28 +128,28 @@ def solve_step(factor: FloatArray, gradient: FloatArray) -> FloatArray:
 
 @compile_borrowing
 def write_damped_step(
-    matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float, place: FloatArray
+    matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float, target: FloatArray
 ) -> float:
-    """Write the place after the step p of (A + λ diag A) p = −g, kept inside [0, 1].
+    """Write the point after the step p of (A + λ diag A) p = −g, kept inside [0, 1].
 
     Returns the promised gain, −gᵀ times the step within the bounds: the linear part of the loss.
     """
     step = solve_step(factor_damped(matrix, gradient, point, damping), gradient)
-    _move_within_bounds(point, step, place)
+    _move_within_bounds(point, step, target)
     promised = 0.0
     for d in range(point.size):
-        promised -= gradient[d] * (place[d] - point[d])
+        promised -= gradient[d] * (target[d] - point[d])
     return promised
 
 
 @compile_borrowing
-def write_spread_place(
-    factor: FloatArray, point: FloatArray, deviation: FloatArray, place: FloatArray
+def write_spread_point(
+    factor: FloatArray, point: FloatArray, deviation: FloatArray, target: FloatArray
 ) -> None:
-    """Write a place whose distance from `point` has covariance A⁻¹, for normal `deviation`.
+    """Write a point whose distance from `point` has covariance A⁻¹, for normal `deviation`.
 
     The distance is long where the output is insensitive, and short across the valley. `factor` is
     that of A.
     """
     _solve_transposed(factor, deviation)
-    _move_within_bounds(point, deviation, place)
+    _move_within_bounds(point, deviation, target)

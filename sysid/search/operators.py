@@ -2,7 +2,8 @@
 
 A chromosome has one unsigned word for each free parameter (Eq. 8, 9). Eq. 9 reads
 θ = lower + (upper − lower)·int/(2^bits − 1). On a logarithmic scale the same rule holds for ln θ.
-The *place* of a parameter is int/(2^bits − 1), a number in [0, 1].
+The *position* of a parameter is int/(2^bits − 1), a number in [0, 1]. The positions of all
+parameters are a *point* of the unit cube.
 
 Random numbers are a pure function of where they are used; no state is stored. The generator is
 Philox4x32-10 (Salmon et al., *Parallel random numbers: as easy as 1, 2, 3*, SC 2011). Its key is
@@ -69,25 +70,25 @@ def to_normal(word: RandomWords) -> float:
 
 
 @compile_borrowing
-def encode(places: FloatArray, bits: int) -> WordArray:
-    """Encode places in [0, 1] as the nearest chromosomes."""
+def encode(points: FloatArray, bits: int) -> WordArray:
+    """Encode points in [0, 1] as the nearest chromosomes."""
     largest = float((1 << bits) - 1)
-    words = np.empty(places.shape, np.uint32)
-    for p in range(places.shape[0]):
-        for d in range(places.shape[1]):
-            words[p, d] = np.uint32(round(min(max(places[p, d], 0.0), 1.0) * largest))
+    words = np.empty(points.shape, np.uint32)
+    for p in range(points.shape[0]):
+        for d in range(points.shape[1]):
+            words[p, d] = np.uint32(round(min(max(points[p, d], 0.0), 1.0) * largest))
     return words
 
 
 @compile_borrowing
 def decode(words: WordArray, bits: int) -> FloatArray:
-    """Decode chromosomes to places in [0, 1]; the inverse of `encode`."""
+    """Decode chromosomes to points in [0, 1]; the inverse of `encode`."""
     largest = float((1 << bits) - 1)
-    places = np.empty(words.shape)
+    points = np.empty(words.shape)
     for p in range(words.shape[0]):
         for d in range(words.shape[1]):
-            places[p, d] = words[p, d] / largest
-    return places
+            points[p, d] = words[p, d] / largest
+    return points
 
 
 @compile_borrowing
@@ -140,21 +141,21 @@ def get_mutation_rate(starts: IntArray, rates: FloatArray, generation: int) -> f
 
 
 @jit_compile
-def reflect_at_bounds(place: float) -> float:
-    """Reflect a place, at most one range outside, at the bound that it has passed."""
-    inside = abs(place)
+def reflect_at_bounds(position: float) -> float:
+    """Reflect a position, at most one range outside, at the bound that it has passed."""
+    inside = abs(position)
     return inside if inside <= 1.0 else max(2.0 - inside, 0.0)
 
 
 @jit_compile
-def mutate_by_step(place: float, size: int, sign: int, bits: int) -> float:
+def mutate_by_step(position: float, size: int, sign: int, bits: int) -> float:
     """Mutate by a scale-free step: its size is log-uniform, and it is reflected at a bound.
 
     A flipped bit also changes the code by a power of two, but some neighbouring values differ in
     many bits (Hamming cliffs). A step on the axis has no such cliffs.
     """
     step = float(2.0 ** (-to_uniform(size) * bits))
-    return reflect_at_bounds(place + (step if sign & 1 else -step))
+    return reflect_at_bounds(position + (step if sign & 1 else -step))
 
 
 @jit_compile

@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
-from sysid.search.archive import SAME_PLACE
+from sysid.search.archive import SAME_POINT
 from sysid.search.least_squares import N_TRIED, ScoredSamples, solve_least_squares, steps_at_once
 from sysid.simulation.evaluator import Evaluator, evaluate_population
 from sysid.simulation.problem import Problem
@@ -55,17 +55,17 @@ def refine_candidates(
     taken: list[FloatArray] = []
     last: tuple[int, RefinedCandidate] | None = None
     for i in np.argsort(values, kind="stable"):
-        place = to_unit(problem.evaluator, np.array(starts[i])[None])[0]
-        is_near_better = any(np.max(np.abs(place - other)) < SAME_PLACE for other in taken)
+        point = to_unit(problem.evaluator, np.array(starts[i])[None])[0]
+        is_near_better = any(np.max(np.abs(point - other)) < SAME_POINT for other in taken)
         if is_near_better or len(taken) == most_starts or not np.isfinite(values[i]):
             continue
-        if budget < place.size + N_TRIED + _END_EVALUATIONS:
+        if budget < point.size + N_TRIED + _END_EVALUATIONS:
             break
         if last is not None and is_late is not None and is_late():
             candidates[last[0]] = replace(last[1], is_cut_short=True)
             break
-        taken.append(place)
-        refined = _refine_place(problem, starts[i], place, float(values[i]), budget, is_late)
+        taken.append(point)
+        refined = _refine_point(problem, starts[i], point, float(values[i]), budget, is_late)
         candidates[i], budget, last = refined, budget - refined.evaluations, (i, refined)
     return tuple(candidates)
 
@@ -76,16 +76,16 @@ def refine_candidate(
     """Refine one start (D,) with its RMS; None if `budget` does not suffice for one step."""
     if budget < start.size + N_TRIED + _END_EVALUATIONS:
         return None
-    place = to_unit(problem.evaluator, start[None])[0]
-    return _refine_place(
-        problem, start, place, rms, min(budget, steps * (start.size + N_TRIED) + _END_EVALUATIONS)
+    point = to_unit(problem.evaluator, start[None])[0]
+    return _refine_point(
+        problem, start, point, rms, min(budget, steps * (start.size + N_TRIED) + _END_EVALUATIONS)
     )
 
 
-def _refine_place(
+def _refine_point(
     problem: Problem,
     start: FloatArray,
-    place: FloatArray,
+    point: FloatArray,
     rms: float,
     budget: int,
     is_late: Callable[[], bool] | None = None,
@@ -98,17 +98,17 @@ def _refine_place(
     scale = max(problem.output_scale, rms)
     unit = ldexp(1.0, frexp(scale)[1]) if scale > 0 else 1.0
     evaluator, rows = problem.evaluator, problem.scored_rows
-    steps = min(_MAX_STEPS, (budget - _END_EVALUATIONS) // (place.size + N_TRIED))
-    at_once = steps_at_once(place.size, problem.n_steps)
+    steps = min(_MAX_STEPS, (budget - _END_EVALUATIONS) // (point.size + N_TRIED))
+    at_once = steps_at_once(point.size, problem.n_steps)
     solved = solve_least_squares(
         ScoredSamples(evaluator, rows, evaluator.weight[rows] / unit),
-        place,
+        point,
         problem.loss_scale / unit,
         steps=steps,
         at_once=at_once,
         is_late=is_late,
     )
-    theta, refined_rms = _snap_to_bounds(evaluator, solved.place)
+    theta, refined_rms = _snap_to_bounds(evaluator, solved.point)
     if refined_rms > rms:
         theta, refined_rms = start, rms
     return RefinedCandidate(
@@ -117,14 +117,14 @@ def _refine_place(
 
 
 @jit_compile
-def _snap_to_bounds(evaluator: Evaluator, place: FloatArray) -> tuple[FloatArray, float]:
+def _snap_to_bounds(evaluator: Evaluator, point: FloatArray) -> tuple[FloatArray, float]:
     """Move a solution (D,) onto a bound that it approaches, if that is not worse."""
-    places = np.empty((2, place.size))
-    for d in range(place.size):
-        places[1, d] = place[d]
-        low, high = place[d] < AT_BOUND, place[d] > 1.0 - AT_BOUND
-        places[0, d] = 0.0 if low else 1.0 if high else place[d]
-    theta = from_unit(evaluator, places)
+    points = np.empty((2, point.size))
+    for d in range(point.size):
+        points[1, d] = point[d]
+        low, high = point[d] < AT_BOUND, point[d] > 1.0 - AT_BOUND
+        points[0, d] = 0.0 if low else 1.0 if high else point[d]
+    theta = from_unit(evaluator, points)
     values = evaluate_population(evaluator, theta)
     chosen = 0 if values[0] <= values[1] * (1.0 + 1e-9) else 1
     return theta[chosen], values[chosen]

@@ -58,8 +58,8 @@ def build_normal_equations(
     evaluator: Evaluator, plan: IslandPlan, point: FloatArray, horizon: float, difference: float
 ) -> tuple[FloatArray, FloatArray, float]:
     """Compute JᵀJ, Jᵀe and the fitness at a point up to `horizon`, in D + 1 simulations."""
-    n, (places, steps) = point.size, step_aside(point, difference)
-    predicted = predict_partially(evaluator, from_unit(evaluator, places), horizon)
+    n, (points, steps) = point.size, step_aside(point, difference)
+    predicted = predict_partially(evaluator, from_unit(evaluator, points), horizon)
     weights, measured, progress = evaluator.weight, evaluator.measured, plan.progress
     # Unsigned, so that no row is checked for being counted from the end.
     rows, error = np.empty(weights.size, np.uint64), np.empty(weights.size)

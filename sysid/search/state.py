@@ -59,12 +59,12 @@ METHOD_SIMPLE, METHOD_PAPER, METHOD_IMPROVED, METHOD_IMPROVED_FIXED_SEQUENCE = 0
 
 
 class KnownFitness(NamedTuple):
-    """Fitness of chromosomes of one island; a new one takes the place of an older one.
+    """Fitness of chromosomes of one island; a new one replaces an older one.
 
     Attributes
     ----------
     words : WordArray, shape (S, D)
-        Chromosomes, each in the place that its own words tell. S is 0 without memory.
+        Chromosomes, each at the index that its own words give. S is 0 without memory.
     fitness : FloatArray, shape (S,)
         Their fitness; ``nan`` where nothing is stored.
     """

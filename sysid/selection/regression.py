@@ -166,14 +166,14 @@ def make_past_reader(
     def read(past: PastValue) -> FloatArray:
         lag = evaluate_lag(past, lags, piece.period)
         if past.kind == "state":
-            return _interpolate_places(
+            return _interpolate_positions(
                 output, np.asarray(rows - past.offset - lag, dtype=np.float64)
             )
         signal = piece.inputs[past.name]
         # At a jump the fine grid has the mean of both sides. Without lag, read after it.
         jump = signal.begin if past.delay is None else 0
-        places = signal.start_index + (rows - past.offset - lag) * signal.points_per_step + jump
-        return _interpolate_places(signal.values, np.asarray(places, dtype=np.float64))
+        positions = signal.start_index + (rows - past.offset - lag) * signal.points_per_step + jump
+        return _interpolate_positions(signal.values, np.asarray(positions, dtype=np.float64))
 
     return read
 
@@ -195,7 +195,7 @@ def evaluate_lag(past: PastValue, lags: Mapping[str, float], period: float) -> f
     return float(whole) if abs(value - whole) < _WHOLE_TOLERANCE else value
 
 
-def _interpolate_places(values: FloatArray, positions: FloatArray) -> FloatArray:
+def _interpolate_positions(values: FloatArray, positions: FloatArray) -> FloatArray:
     positions = np.clip(positions, 0.0, values.size - 1.0)
     older = np.floor(positions).astype(np.int64)
     share = positions - older
@@ -219,14 +219,14 @@ def _make_regression_experiment(
         if output_channel.name == model.outputs[0].name
     ]
     grid = experiment.grid
-    places = np.round(samples.places).astype(np.int64)
+    positions = np.round(samples.positions).astype(np.int64)
     output = np.full(grid.points, np.nan)
-    output[places] = np.where(np.isfinite(channel.values), channel.values, np.nan)
+    output[positions] = np.where(np.isfinite(channel.values), channel.values, np.nan)
     longest = 0.0
     for past in {factor for term in model.terms for factor in term.factors}:
         upper = 0.0 if past.delay is None else bound_expression(past.delay, spans, grid.step)[1]
         longest = max(longest, past.offset + upper)
-    scored = np.sort(places[samples.weights > 0])
+    scored = np.sort(positions[samples.weights > 0])
     inputs = {
         quantity.name: signal
         for quantity, signal in zip(model.inputs, experiment.inputs, strict=True)

@@ -229,11 +229,11 @@ class _StartFinder:
         for piece, experiment in zip(
             self._regression.experiments, problem.experiments, strict=True
         ):
-            places = np.round(experiment.outputs[0].places).astype(np.int64)
+            positions = np.round(experiment.outputs[0].positions).astype(np.int64)
             output = np.full(piece.output.size, np.nan)
-            output[places] = predicted[first : first + places.size]
+            output[positions] = predicted[first : first + positions.size]
             outputs.append(output)
-            first += places.size
+            first += positions.size
         return outputs
 
     def _evaluate_starts(

@@ -286,7 +286,7 @@ def _replace_samples(
     """Replace the values of samples; weights that are equal remain the same array."""
     weights = np.where(_is_scored(channel, skip, scored_from), weight, 0.0)
     return OutputSamples(
-        samples.places,
+        samples.positions,
         np.where(np.isfinite(channel.values), channel.values, 0.0),
         samples.weights if np.array_equal(weights, samples.weights) else weights,
         _interpolate_to_grid(grid, channel),

@@ -102,9 +102,9 @@ def locate_samples(grid: Grid, model: Model, channel: Channel) -> FloatArray:
     return whole
 
 
-def is_on_grid(places: FloatArray) -> bool:
+def is_on_grid(positions: FloatArray) -> bool:
     """Return whether each sample has its own grid point."""
-    return bool(np.all(places == np.round(places)) and np.all(np.diff(places) > 0))
+    return bool(np.all(positions == np.round(positions)) and np.all(np.diff(positions) > 0))
 
 
 def _make_sample_grid(outputs: Sequence[Channel], substeps: int) -> Grid:

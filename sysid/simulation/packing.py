@@ -33,7 +33,7 @@ _HISTORY_SLACK = 512  # rows of history beyond the largest delay: they are moved
 class OutputSamples:
     """Measured samples of one output: positions on the grid, values (0: missing), weights."""
 
-    places: FloatArray
+    positions: FloatArray
     values: FloatArray
     weights: FloatArray
     grid_values: FloatArray
@@ -181,7 +181,7 @@ def pack_experiment(
         builder.write_entries(
             "output", i, first=first, grid=builder.add_floats(samples.grid_values)
         )
-        first += samples.places.size
+        first += samples.positions.size
     columns = sum(history.columns for history in list_stored_histories(model))
     n_work = max(columns * rows * LANES, 1)
     return PackedExperiment(*builder.build_arrays(), n_work)
@@ -205,7 +205,7 @@ def replace_measured(
     for i, samples in enumerate(outputs):
         measured = floats[ints[layout.locate_output(i, "measured")] :]
         if on_grid:
-            measured[samples.places.astype(np.int64)] = samples.values
+            measured[samples.positions.astype(np.int64)] = samples.values
         else:
             measured[: samples.values.size] = samples.values
         grid = ints[layout.locate_output(i, "grid")]
@@ -251,7 +251,7 @@ def _pack_grid_samples(
     builder: _ArrayBuilder, i: int, samples: OutputSamples, grid: Grid, first: int
 ) -> None:
     """Pack dense arrays over the grid points: row of the prediction or -1, value, weight."""
-    points = samples.places.astype(np.int64)
+    points = samples.positions.astype(np.int64)
     rows = np.full(grid.points, -1, dtype=np.int64)
     rows[points] = first + np.arange(points.size)
     values, weights = np.zeros(grid.points), np.zeros(grid.points)
@@ -269,8 +269,8 @@ def _pack_scattered_samples(
     builder: _ArrayBuilder, i: int, samples: OutputSamples, grid: Grid, first: int
 ) -> None:
     """Pack for each grid interval (n - 1, n] the bounds of its samples and their positions."""
-    interval = np.ceil(samples.places)
-    fraction = samples.places - (interval - 1.0)
+    interval = np.ceil(samples.positions)
+    fraction = samples.positions - (interval - 1.0)
     interval_bounds = np.searchsorted(interval, np.arange(grid.points + 1), side="left")
     builder.write_entries(
         "output",
@@ -284,12 +284,12 @@ def _pack_scattered_samples(
 
 def are_on_grid(outputs: Sequence[OutputSamples]) -> bool:
     """Return whether each sample of each output has its own grid point."""
-    return all(is_on_grid(samples.places) for samples in outputs)
+    return all(is_on_grid(samples.positions) for samples in outputs)
 
 
 def has_weights(outputs: Sequence[OutputSamples], grid: Grid, on_grid: bool) -> bool:
     """Return whether some weight is not 1; a grid point without a sample has weight 0."""
     return any(
-        bool(np.any(samples.weights != 1.0)) or (on_grid and samples.places.size != grid.points)
+        bool(np.any(samples.weights != 1.0)) or (on_grid and samples.positions.size != grid.points)
         for samples in outputs
     )

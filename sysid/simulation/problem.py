@@ -321,8 +321,8 @@ class Problem:
         for experiment in self.experiments:
             part = {}
             for output, samples in zip(self.model.outputs, experiment.outputs, strict=True):
-                part[output.name] = values[first : first + samples.places.size]
-                first += samples.places.size
+                part[output.name] = values[first : first + samples.positions.size]
+                first += samples.positions.size
             parts.append(part)
         return parts
 
@@ -438,7 +438,7 @@ def _compute_channel_metrics(problem: Problem, simulated: FloatArray) -> list[Ch
         strict=True,
     )
     for experiment, (measured, model, weight) in enumerate(parts):
-        places = (samples.places for samples in problem.experiments[experiment].outputs)
+        places = (samples.positions for samples in problem.experiments[experiment].outputs)
         for output, x in zip(problem.model.outputs, places, strict=True):
             scored = weight[output.name] > 0
             if np.any(scored):
@@ -553,7 +553,7 @@ def _locate_experiments(
 ) -> Any:
     """Compute where each experiment's numbers and its measured values begin."""
     lengths = [
-        (packed.ints.size, packed.floats.size, sum(s.places.size for s in e.outputs))
+        (packed.ints.size, packed.floats.size, sum(s.positions.size for s in e.outputs))
         for packed, e in zip(packed_experiments, experiments, strict=True)
     ]
     ends = np.cumsum(np.array(lengths, dtype=np.int64), axis=0)
@@ -577,7 +577,7 @@ def compute_record_progress(problem: Problem) -> FloatArray:
         "record progress",
         lambda: np.concatenate(
             [
-                np.ceil(samples.places) / max(experiment.grid.points - 1, 1)
+                np.ceil(samples.positions) / max(experiment.grid.points - 1, 1)
                 for experiment in problem.experiments
                 for samples in experiment.outputs
             ]

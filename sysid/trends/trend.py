@@ -396,8 +396,8 @@ def compute_law_drifts(
         law_errors = (law.error_factor * law.evaluate_stderr(at)).tolist()
     limit = compute_drift_limit(law, comparisons)
     return tuple(
-        _compute_point_drift(estimate, place, error, limit)
-        for estimate, place, error in zip(new, predictions, law_errors, strict=True)
+        _compute_point_drift(estimate, predicted, error, limit)
+        for estimate, predicted, error in zip(new, predictions, law_errors, strict=True)
     )
 
 

@@ -169,14 +169,14 @@ def _analyse_sensitivities(
         return Analysis(
             _make_estimates_without_stderr(problem, theta, reason), None, 0.0, count, criteria
         )
-    place = to_unit(problem.evaluator, theta[None])[0]
+    point = to_unit(problem.evaluator, theta[None])[0]
     decomposition = compute_truncated_svd(columns)
     # No step of least squares gains from a parameter on a plateau: there the loss is flat.
     has_plateau = bool((plateau > 0).any())
     sloping = np.where(plateau > 0, 0.0, columns) if has_plateau else columns
     influence = compute_influence(error, problem.loss_scale)
-    gain = _compute_possible_gain(influence, sloping, place, None if has_plateau else decomposition)
-    is_pulled = is_active(influence, sloping, place)
+    gain = _compute_possible_gain(influence, sloping, point, None if has_plateau else decomposition)
+    is_pulled = is_active(influence, sloping, point)
     scale = compute_physical_scale(problem, theta)
     powers = problem.share("scalings", lambda: find_scalings(problem.model, problem.all_parameters))
     left = None if max_simulations is None else max_simulations - count
@@ -220,7 +220,7 @@ def _analyse_sensitivities(
     )
     combined = {name for group in uncertainty.groups for name in group.members}
     statuses = _classify_parameters(
-        place, blocks, is_pulled, np.array([name in combined for name in names])
+        point, blocks, is_pulled, np.array([name in combined for name in names])
     )
     statistics = LocalStatistics(
         theta,
@@ -239,9 +239,9 @@ def _analyse_sensitivities(
     if problem.loss_scale == 0.0:
         stated = np.diag(covariance)
         root = singular[:, None] * rows
-        linear = linearise_outputs(error, columns, plateau > 0, place, stated, scale, inverse, root)
+        linear = linearise_outputs(error, columns, plateau > 0, point, stated, scale, inverse, root)
     active_bounds = (
-        _find_active_bounds(problem, influence, sloping, place) if is_pulled.any() else ()
+        _find_active_bounds(problem, influence, sloping, point) if is_pulled.any() else ()
     )
     return Analysis(
         estimates,
@@ -257,14 +257,14 @@ def _analyse_sensitivities(
 
 
 def _find_active_bounds(
-    problem: Problem, influence: FloatArray, columns: FloatArray, place: FloatArray
+    problem: Problem, influence: FloatArray, columns: FloatArray, point: FloatArray
 ) -> tuple[ActiveBound, ...]:
-    at_end = np.logical_or(*is_at_bounds(place))
+    at_end = np.logical_or(*is_at_bounds(point))
     limits = tuple(
         find_widest_bounds(problem, parameter) if is_at_end else (parameter.lower, parameter.upper)
         for parameter, is_at_end in zip(problem.free_parameters, at_end, strict=True)
     )
-    return rank_active_bounds(problem.free_parameters, limits, influence, columns, place)
+    return rank_active_bounds(problem.free_parameters, limits, influence, columns, point)
 
 
 def compute_criteria(
@@ -355,7 +355,7 @@ def _centre_on_plateau(estimate: Estimate, plateau_offset: float) -> Estimate:
 def _compute_possible_gain(
     influence: FloatArray,
     columns: FloatArray,
-    place: FloatArray,
+    point: FloatArray,
     decomposition: TruncatedSvd | None = None,
 ) -> float:
     """Share of Σψ² in the span of the sensitivities along which the parameters may move.
@@ -364,7 +364,7 @@ def _compute_possible_gain(
     not move. Then the bound holds it, and the estimate is optimal inside its bounds. A known
     `decomposition` of the sensitivities is used where all parameters may move.
     """
-    at_lower, at_upper = is_at_bounds(place)
+    at_lower, at_upper = is_at_bounds(point)
     if not influence.any():
         return 0.0
     if np.any(at_lower | at_upper):
@@ -434,7 +434,7 @@ def _classify_noise_colour(colour: Sandwich | None, whitening: Whitening | None)
 
 
 def _classify_parameters(
-    place: FloatArray,
+    point: FloatArray,
     blocks: tuple[ParameterBlock, ...],
     is_pulled: BoolArray,
     is_combined: BoolArray,
@@ -445,8 +445,8 @@ def _classify_parameters(
     unidentifiable by itself. If the data pull a parameter beyond its bound, they contain
     information about it, even if the bound leaves large residuals and standard errors.
     """
-    statuses: list[EstimateStatus] = ["identified"] * place.size
-    for d in np.flatnonzero(np.logical_or(*is_at_bounds(place))):
+    statuses: list[EstimateStatus] = ["identified"] * point.size
+    for d in np.flatnonzero(np.logical_or(*is_at_bounds(point))):
         statuses[d] = "at bound"
     for block in blocks:
         for d in block.members:

@@ -70,7 +70,7 @@ def linearise_outputs(
     error: FloatArray,
     columns: FloatArray,
     on_plateau: BoolArray,
-    place: FloatArray,
+    point: FloatArray,
     stated: FloatArray,
     scale: FloatArray,
     inverse: FloatArray,
@@ -86,7 +86,7 @@ def linearise_outputs(
         Their slopes in unit coordinates p.
     on_plateau : BoolArray, shape (D,)
         Parameters that are held.
-    place : FloatArray, shape (D,)
+    point : FloatArray, shape (D,)
         The estimate in unit coordinates.
     stated : FloatArray, shape (D,)
         Reported variances in unit coordinates, without the width of a plateau.
@@ -106,7 +106,7 @@ def linearise_outputs(
     if on_plateau.any():
         slope[on_plateau] = 0.0
         inverse, root = _remove_parameters(root, on_plateau)
-    at_lower, at_upper = is_at_bounds(place)
+    at_lower, at_upper = is_at_bounds(point)
     leads_out = (at_lower & (slope > 0)) | (at_upper & (slope < 0))
     unit = np.where(scale > 0, scale, 1.0)
     return LinearOutputModel(

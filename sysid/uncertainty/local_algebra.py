@@ -1,6 +1,6 @@
 """Small sums and matrices of the local analysis, compiled.
 
-n samples, D parameters. Places and sensitivities are in unit coordinates p in [0, 1].
+n samples, D parameters. Points and sensitivities are in unit coordinates p in [0, 1].
 """
 
 import numpy as np

@@ -99,7 +99,7 @@ def compute_output_bands(
     source: Literal["covariance", "posterior"] = (
         "covariance" if spread.samples is None else "posterior"
     )
-    places = problem.split_by_output(np.arange(simulated.size, dtype=np.float64))
+    indices = problem.split_by_output(np.arange(simulated.size, dtype=np.float64))
     return tuple(
         tuple(
             OutputBands(
@@ -116,7 +116,7 @@ def compute_output_bands(
             for channel in record.outputs
             for rows in [part[channel.name].astype(np.int64)]
         )
-        for e, (record, part) in enumerate(zip(problem.records, places, strict=True))
+        for e, (record, part) in enumerate(zip(problem.records, indices, strict=True))
     )
 
 

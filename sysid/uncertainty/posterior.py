@@ -43,7 +43,7 @@ _BURN_IN = 5  # the first of so many parts is left out
 _MIN_TIMES = 50.0  # autocorrelation times that a converged chain is long
 _WINDOW = 5.0  # autocorrelation times over which correlations are summed
 _ALIKE = 2.0  # ratio of the widths of two intervals
-_SAME_PLACE = 1e-3  # of the range: a minimum nearer to the estimate is the estimate
+_SAME_POINT = 1e-3  # of the range: a minimum nearer to the estimate is the estimate
 _MIN_STEPS = 20  # of a chain that is worth reporting
 _MAX_SIMULATIONS = 200_000
 _MAX_WORK = 1_000_000_000  # steps of integration or recursion: about 10 s
@@ -152,9 +152,9 @@ class _Sampler:
         self._problem, self._groups = problem, groups
         self._likelihood = Likelihood(problem, likelihood)
         self._random = np.random.Generator(np.random.Philox(key=[seed, _RANDOM_STREAM]))
-        places = to_unit(problem.evaluator, centres)
-        is_other = np.max(np.abs(places - places[0]), axis=1) > _SAME_PLACE
-        self._centres = np.vstack([places[:1], places[is_other]])
+        points = to_unit(problem.evaluator, centres)
+        is_other = np.max(np.abs(points - points[0]), axis=1) > _SAME_POINT
+        self._centres = np.vstack([points[:1], points[is_other]])
         self._spread = _factor_start_covariance(likelihood)
         self._least_ratio, self.evaluations, self._cause = 0.0, 0, _LIMIT_MET
         wanted = max(_MIN_WALKERS, _WALKERS_PER_PARAMETER * centres.shape[1])
@@ -180,9 +180,9 @@ class _Sampler:
             moves=list(zip(moves, shares, strict=True)),
             vectorize=True,
         )
-        places, logarithms = self._make_starts()
+        points, logarithms = self._make_starts()
         random = np.random.RandomState(int(self._random.integers(2**32))).get_state()
-        state = State(places, log_prob=logarithms, random_state=random)
+        state = State(points, log_prob=logarithms, random_state=random)
         steps = self._ensemble.sample(
             state, iterations=limit // (self._walkers // 2), skip_initial_state_check=True
         )
@@ -235,13 +235,13 @@ class _Sampler:
             abs(self._least_ratio),
         )
 
-    def _compute_logarithms(self, places: FloatArray) -> FloatArray:
-        """Compute the logarithm (P,) of the posterior at places (P, D)."""
-        logarithms = np.full(len(places), -np.inf)
-        inside = np.all((places >= 0.0) & (places <= 1.0), axis=1)
+    def _compute_logarithms(self, points: FloatArray) -> FloatArray:
+        """Compute the logarithm (P,) of the posterior at points (P, D)."""
+        logarithms = np.full(len(points), -np.inf)
+        inside = np.all((points >= 0.0) & (points <= 1.0), axis=1)
         if inside.any():
             ratios = self._likelihood.compute_ratios(
-                from_unit(self._problem.evaluator, places[inside])
+                from_unit(self._problem.evaluator, points[inside])
             )
             self.evaluations += ratios.size
             self._least_ratio = min(self._least_ratio, float(np.min(ratios)))
@@ -249,7 +249,7 @@ class _Sampler:
         return logarithms
 
     def _make_starts(self) -> tuple[FloatArray, FloatArray]:
-        """Draw places (W, D) of the walkers around the minima, with their logarithms (W,).
+        """Draw points (W, D) of the walkers around the minima, with their logarithms (W,).
 
         A minimum has as many walkers as its likelihood suggests. Walkers that are much less likely
         than their minimum would hardly move, so they start nearer to it.
@@ -261,17 +261,17 @@ class _Sampler:
         )
         centres, dimensions = self._centres[chosen], self._centres.shape[1]
         moves = self._random.standard_normal(centres.shape) @ self._spread
-        places = _fold(centres + moves)
-        logarithms = self._compute_logarithms(places)
+        points = _fold(centres + moves)
+        logarithms = self._compute_logarithms(points)
         least = of_centres[chosen] - (dimensions + _MAX_DROP)
         for _ in range(_MAX_SHRINKS):
             far = np.flatnonzero(~(logarithms >= least))
             if not far.size:
                 break
             moves[far] *= 0.5
-            places[far] = _fold(centres[far] + moves[far])
-            logarithms[far] = self._compute_logarithms(places[far])
-        return places, logarithms
+            points[far] = _fold(centres[far] + moves[far])
+            logarithms[far] = self._compute_logarithms(points[far])
+        return points, logarithms
 
     def _find_cause(self, limit: int, is_late: Callable[[], bool]) -> str:
         """Find what ends the chain; empty if nothing does."""
@@ -303,9 +303,9 @@ def _factor_start_covariance(likelihood: LikelihoodModel) -> FloatArray:
     return deviation[:, None] * rows
 
 
-def _fold(places: FloatArray) -> FloatArray:
-    """Reflect places at 0 and 1."""
-    return np.asarray(1.0 - np.abs(1.0 - np.mod(places, 2.0)))
+def _fold(points: FloatArray) -> FloatArray:
+    """Reflect points at 0 and 1."""
+    return np.asarray(1.0 - np.abs(1.0 - np.mod(points, 2.0)))
 
 
 def _compute_autocorrelation_times(chain: FloatArray) -> FloatArray:

@@ -169,27 +169,29 @@ class _ProfileSearch:
         self._larger = [i for i, above in partners if above > 0]
         self._smaller = [i for i, above in partners if above < 0]
         self.is_stopped, self.evaluations = False, 1
-        self._place = float(to_unit(problem.evaluator, theta[None])[0, d])
+        self._position = float(to_unit(problem.evaluator, theta[None])[0, d])
         rms = float(problem.evaluate_fitness(theta[None])[0])
-        self._fits = {self._place: (theta, rms)}
+        self._fits = {self._position: (theta, rms)}
         self.half_width = self._predict_half_width(theta)
 
     def extend_side(self, step: float, count: int) -> None:
         """Extend the profile to one side, until the threshold is passed or a bound is reached."""
-        place, taken = self._place, 0
-        while taken < _MAX_STEPS and not self._is_side_complete(place, taken, count):
-            nearer, place = place, min(max(place + step, 0.0), 1.0)
-            if place == nearer:
+        position, taken = self._position, 0
+        while taken < _MAX_STEPS and not self._is_side_complete(position, taken, count):
+            nearer, position = position, min(max(position + step, 0.0), 1.0)
+            if position == nearer:
                 return  # at the bound
-            self._fit_others(place, nearer)
+            self._fit_others(position, nearer)
             taken += 1
             step *= _STEP_GROWTH if taken >= count else 1.0
 
     def find_interval_end(self, side: float) -> float | None:
         """Find the coordinate at which the ratio crosses the threshold; None if it does not."""
-        inside = min(self._fits, key=lambda place: self._fits[place][1])
-        places = sorted((p for p in self._fits if side * (p - inside) > 0), key=lambda p: side * p)
-        for outside in places:
+        inside = min(self._fits, key=lambda position: self._fits[position][1])
+        positions = sorted(
+            (p for p in self._fits if side * (p - inside) > 0), key=lambda p: side * p
+        )
+        for outside in positions:
             if self._compute_ratio(outside) >= CHI_SQUARE_95:
                 return self._find_crossing(inside, outside)
             inside = outside
@@ -199,8 +201,8 @@ class _ProfileSearch:
         """Return the profile in the parameter's unit."""
         parameter = self._problem.free_parameters[self._d]
         order = sorted(self._fits)
-        thetas = np.array([self._fits[place][0] for place in order])
-        best = min(self._fits, key=lambda place: self._fits[place][1])
+        thetas = np.array([self._fits[position][0] for position in order])
+        best = min(self._fits, key=lambda position: self._fits[position][1])
         low_, high_ = (
             None if end is None else self._to_parameter_value(end) for end in (low, high)
         )
@@ -208,8 +210,8 @@ class _ProfileSearch:
             name=parameter.name,
             unit=parameter.unit,
             values=thetas[:, self._d],
-            likelihood_ratio=np.array([self._compute_ratio(place) for place in order]),
-            rms=np.array([self._fits[place][1] for place in order]),
+            likelihood_ratio=np.array([self._compute_ratio(position) for position in order]),
+            rms=np.array([self._fits[position][1] for position in order]),
             others=np.delete(thetas, self._d, axis=1),
             interval=(low_, high_),
             estimate=self._to_parameter_value(best),
@@ -254,14 +256,14 @@ class _ProfileSearch:
             direction, float(np.mean(np.square(influence))), norm
         )
 
-    def _is_side_complete(self, place: float, taken: int, count: int) -> bool:
+    def _is_side_complete(self, position: float, taken: int, count: int) -> bool:
         self.is_stopped = self.is_stopped or bool(self._should_stop and self._should_stop())
-        return self.is_stopped or (taken >= count and self._compute_ratio(place) > CHI_SQUARE_95)
+        return self.is_stopped or (taken >= count and self._compute_ratio(position) > CHI_SQUARE_95)
 
-    def _fit_others(self, place: float, nearer: float) -> None:
+    def _fit_others(self, position: float, nearer: float) -> None:
         """Estimate the others at a coordinate, starting from their values at a nearer one."""
         d, start = self._d, self._fits[nearer][0].copy()
-        start[d] = self._to_parameter_value(place)
+        start[d] = self._to_parameter_value(position)
         fixed = _fix_parameter(self._restrict_exchanges(float(start[d])), d, float(start[d]))
         others = np.clip(np.delete(start, d), fixed.evaluator.lower, fixed.evaluator.upper)
         rms = float(fixed.evaluate_fitness(others[None])[0])
@@ -271,7 +273,7 @@ class _ProfileSearch:
             if end is not None:
                 others, rms = end.theta, end.rms
                 self.evaluations += end.evaluations
-        self._fits[place] = (np.insert(others, d, start[d]), rms)
+        self._fits[position] = (np.insert(others, d, start[d]), rms)
 
     def _restrict_exchanges(self, value: float) -> Problem:
         """Restrict exchangeable parameters to their side of a value.
@@ -310,17 +312,17 @@ class _ProfileSearch:
         share = (np.sqrt(CHI_SQUARE_95) - a) / (b - a) if b > a else 0.5
         return float(inside + min(max(share, 0.02), 0.98) * (outside - inside))
 
-    def _compute_ratio(self, place: float) -> float:
+    def _compute_ratio(self, position: float) -> float:
         best = min(rms for _, rms in self._fits.values())
-        rms = self._fits[place][1]
+        rms = self._fits[position][1]
         if rms == best:
             return 0.0
         return 2.0 * self._factor * self._problem.n_scored * float(np.log(rms / best))
 
-    def _to_parameter_value(self, place: float) -> float:
-        if place in self._fits:
-            return float(self._fits[place][0][self._d])
-        every = np.full((1, len(self._problem.free_parameters)), place)
+    def _to_parameter_value(self, position: float) -> float:
+        if position in self._fits:
+            return float(self._fits[position][0][self._d])
+        every = np.full((1, len(self._problem.free_parameters)), position)
         return float(from_unit(self._problem.evaluator, every)[0, self._d])
 
 

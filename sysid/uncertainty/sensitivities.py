@@ -76,7 +76,7 @@ def compute_sensitivities(
         If they take more than `max_simulations` simulations.
     """
     probe = _OutputProbe(problem, theta, max_simulations)
-    d = probe.place.size
+    d = probe.point.size
     plateau, middle = np.zeros(d), np.zeros(d)
     one_sided = np.zeros(d, dtype=np.bool_)
     parameters = np.arange(2 * d)
@@ -147,7 +147,7 @@ def _estimate_slope_near_jumps(probe: "_OutputProbe", d: int) -> FloatArray:
 
 def _estimate_side_slope(probe: "_OutputProbe", d: int, side: float) -> tuple[float, FloatArray]:
     """Find the neighbouring segments that agree best: their difference and slope (n,)."""
-    room = 1.0 - probe.place[d] if side > 0 else probe.place[d]
+    room = 1.0 - probe.point[d] if side > 0 else probe.point[d]
     ends = side * _SEGMENT_EDGES[room >= _SEGMENT_EDGES]
     if ends.size < 2:
         return np.inf, np.zeros(probe.predicted.size)
@@ -170,7 +170,7 @@ class _OutputProbe:
         self._problem, self._theta, self._most = problem, theta, max_simulations
         self.weight = problem.evaluator.weight[problem.scored_rows]
         self.measured = problem.evaluator.measured[problem.scored_rows]
-        self.place = to_unit(problem.evaluator, theta[None])[0]
+        self.point = to_unit(problem.evaluator, theta[None])[0]
         self.predicted = problem.predict(theta[None])[0][problem.scored_rows]
         self.evaluations = 1
 
@@ -182,21 +182,21 @@ class _OutputProbe:
     def simulate_steps(self, which: IntArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Simulate steps, cut off at the bounds: steps taken and outputs (n, len(which)).
 
-        The other parameters keep their bits. Converted to places and back they might be rounded,
+        The other parameters keep their bits. Converted to points and back they might be rounded,
         and the output would seem to change on a plateau.
         """
         if self._most is not None and self.evaluations + which.size > self._most:
             raise BudgetSpentError(self.evaluations, self.residuals)
-        moved = np.clip(self.place[which] + steps, 0.0, 1.0)
+        moved = np.clip(self.point[which] + steps, 0.0, 1.0)
         rows = np.arange(which.size)
-        places = np.repeat(self.place[None], which.size, axis=0)
-        places[rows, which] = moved
+        points = np.repeat(self.point[None], which.size, axis=0)
+        points[rows, which] = moved
         around = np.repeat(self._theta[None], which.size, axis=0)
-        around[rows, which] = from_unit(self._problem.evaluator, places)[rows, which]
+        around[rows, which] = from_unit(self._problem.evaluator, points)[rows, which]
         predicted = self._problem.predict(around)
         self.evaluations += which.size
         scored = predicted[:, self._problem.scored_rows]
-        return moved - self.place[which], np.ascontiguousarray(scored.T)
+        return moved - self.point[which], np.ascontiguousarray(scored.T)
 
     def find_jumps(self, which: IntArray, side: float) -> tuple[FloatArray, FloatArray]:
         """Find each parameter's nearest jump on one side: its distance and the outputs beyond it.

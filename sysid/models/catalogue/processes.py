@@ -1,4 +1,4 @@
-"""The catalogue's family of processes with dead time, and the place of each entry in it.
+"""The catalogue's family of processes with dead time, and the position of each entry in it.
 
 A process is K e^(-Ls)/((T1 s + 1)(T2 s + 1)…), or the same behind an integrator 1/s. Entries of the
 family differ in the number of their first-order parts. So each has a neighbour with one order more
@@ -33,7 +33,7 @@ class Process(NamedTuple):
 
 
 class ProcessEntry(NamedTuple):
-    """The place of a model of the catalogue in the family.
+    """The position of a model of the catalogue in the family.
 
     Attributes
     ----------

@@ -12,7 +12,7 @@ from sysid.data.records import Channel, Record
 from sysid.identification import best_estimate
 from sysid.identification.identify import identify
 from sysid.minima.minima import scan_by_projection
-from sysid.minima.projection import draw_projected_places, find_linear_parameters
+from sysid.minima.projection import draw_projected_points, find_linear_parameters
 from sysid.minima.search_evidence import is_explained
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
@@ -73,14 +73,14 @@ def test_a_nonlinear_model_has_no_linear_parameter_and_costs_no_more_than_the_te
     problem = example()
     theta = np.array([0.2, 0.5, 5.0, 1.0])
     assert find_linear_parameters(problem, theta)[0] == []
-    places, fitness, spent = draw_projected_places(problem, theta, 1, 5000)
+    places, fitness, spent = draw_projected_points(problem, theta, 1, 5000)
     assert (len(places), len(fitness)) == (0, 0)
     assert spent <= 3 * theta.size + 1
 
 
 def test_at_drawn_places_no_linear_parameter_can_be_better() -> None:
     problem = plant()
-    places, fitness, spent = draw_projected_places(problem, place(problem), 1, 2000)
+    places, fitness, spent = draw_projected_points(problem, place(problem), 1, 2000)
     lower, upper = problem.evaluator.lower, problem.evaluator.upper
     assert len(places) > 100
     assert spent <= 2000
@@ -116,7 +116,7 @@ def test_a_scan_by_projection_leads_out_of_a_false_minimum(seed: int) -> None:
 def test_a_budget_is_kept_and_a_small_one_draws_nothing() -> None:
     problem = plant()
     for budget in (0, 10, 100, 300, 700):
-        places, _, spent = draw_projected_places(problem, place(problem), 1, budget)
+        places, _, spent = draw_projected_points(problem, place(problem), 1, budget)
         assert spent <= budget
         assert (len(places) > 0) == (budget >= 700)
 

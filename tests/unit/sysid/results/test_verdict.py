@@ -203,5 +203,5 @@ def test_the_order_that_the_data_prefer_is_not_blamed_for_coloured_residuals() -
 def test_names_and_reasons_are_those_of_free_parameters() -> None:
     evidence = Evidence(estimates=[estimate("K", "fixed"), estimate("T", "at bound")])
     assert evidence.list_names("fixed", "at bound") == ["T"]
-    assert evidence.tell_reasons("fixed") == ""
-    assert evidence.tell_reasons("at bound").startswith("T = ")
+    assert evidence.describe_reasons("fixed") == ""
+    assert evidence.describe_reasons("at bound").startswith("T = ")

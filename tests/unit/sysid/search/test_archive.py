@@ -4,7 +4,7 @@ import numpy as np
 
 from sysid.core.settings import GeneticAlgorithm
 from sysid.identification.run import advance_run, begin_run
-from sysid.search.archive import SAME_PLACE, archive_end, make_archive, read_archive
+from sysid.search.archive import SAME_POINT, archive_end, make_archive, read_archive
 from sysid.simulation.scaling import to_unit
 from tests.searching import example
 
@@ -12,12 +12,12 @@ from tests.searching import example
 def test_ends_at_one_place_are_counted_and_the_lowest_is_kept() -> None:
     archive, place = make_archive(2), np.array([0.3, 0.7])
     archive_end(archive, place, 2.0)
-    archive_end(archive, place + 0.5 * SAME_PLACE, 1.0)
-    archive_end(archive, place - 0.4 * SAME_PLACE, 3.0)
-    archive_end(archive, place + np.array([0.0, 2 * SAME_PLACE]), 4.0)
+    archive_end(archive, place + 0.5 * SAME_POINT, 1.0)
+    archive_end(archive, place - 0.4 * SAME_POINT, 3.0)
+    archive_end(archive, place + np.array([0.0, 2 * SAME_POINT]), 4.0)
     first, second = read_archive(archive)
     assert (first.count, second.count) == (3, 1)
-    np.testing.assert_array_equal(first.place, place + 0.5 * SAME_PLACE)
+    np.testing.assert_array_equal(first.point, place + 0.5 * SAME_POINT)
 
 
 def test_a_full_archive_forgets_its_worst_minimum_for_a_better_one() -> None:
@@ -26,9 +26,9 @@ def test_a_full_archive_forgets_its_worst_minimum_for_a_better_one() -> None:
     for number in range(size):
         archive_end(archive, np.array([number / size]), float(size - number))
     archive_end(archive, np.array([0.99]), size + 1.0)  # worse than all
-    assert 0.99 not in {one.place[0] for one in read_archive(archive)}
+    assert 0.99 not in {one.point[0] for one in read_archive(archive)}
     archive_end(archive, np.array([0.99]), 0.5)
-    places = {one.place[0] for one in read_archive(archive)}
+    places = {one.point[0] for one in read_archive(archive)}
     assert 0.99 in places
     assert 0.0 not in places
     assert len(places) == size
@@ -43,13 +43,13 @@ def test_a_search_archives_where_its_random_starts_end() -> None:
         minima = read_archive(island.archive)
         counted += sum(minimum.count for minimum in minima)
         assert sum(minimum.count for minimum in minima) <= island.search["random_starts"]
-        places = np.array([minimum.place for minimum in minima])
+        places = np.array([minimum.point for minimum in minima])
         assert np.all((places >= 0.0) & (places <= 1.0))
     assert counted >= found.islands[0].search["confirmed_starts"] > 0
     best = min(found.islands, key=lambda island: island.champion_rms)
     champion = to_unit(problem.evaluator, np.array(best.history[-1].parameters)[None])[0]
     distances = [
-        np.max(np.abs(minimum.place - champion))
+        np.max(np.abs(minimum.point - champion))
         for island in found.islands
         for minimum in read_archive(island.archive)
     ]

@@ -75,7 +75,7 @@ def test_the_optimum_is_that_of_the_library(seed: int, scale: float) -> None:
     start = [0.5, 0.4, 0.5, 0.5]
     ended = found(scored(DECAY, "abpq", measured), start, scale)
     assert ended.is_converged
-    np.testing.assert_allclose(ended.place, library(measured, start, scale), atol=2e-4)
+    np.testing.assert_allclose(ended.point, library(measured, start, scale), atol=2e-4)
 
 
 def test_a_place_whose_optimum_lies_outside_ends_at_the_bound_and_the_others_at_their_best() -> (
@@ -83,19 +83,19 @@ def test_a_place_whose_optimum_lies_outside_ends_at_the_bound_and_the_others_at_
 ):
     measured = decay(np.array([0.4, 1.3, 0.6, 0.4]))
     ended = found(scored(DECAY, "abpq", measured), [0.5] * 4)
-    assert ended.place[1] == 1.0
-    np.testing.assert_allclose(ended.place, library(measured, [0.5] * 4), atol=1e-3)
+    assert ended.point[1] == 1.0
+    np.testing.assert_allclose(ended.point, library(measured, [0.5] * 4), atol=1e-3)
 
 
 def test_a_place_without_effect_stays_where_it_is() -> None:
     ended = found(scored("a*t + 0*b", "ab", 0.3 * TIMES), [0.9, 0.7], steps=20)
-    np.testing.assert_allclose(ended.place, [0.3, 0.7], atol=1e-9)
+    np.testing.assert_allclose(ended.point, [0.3, 0.7], atol=1e-9)
 
 
 def test_a_step_into_a_region_that_diverges_is_not_taken() -> None:
     subject = scored("where(a < 0.3, 1/(0*a), a)", "a", np.full(60, 0.31))
     ended = found(subject, [0.9], steps=50)
-    assert ended.place[0] == pytest.approx(0.31, abs=1e-6)
+    assert ended.point[0] == pytest.approx(0.31, abs=1e-6)
 
 
 def test_the_steps_allowed_bound_the_simulations() -> None:
@@ -109,7 +109,7 @@ def test_the_slopes_of_a_place_are_taken_once_however_often_steps_from_it_are_re
     subject = scored("where(a == 0.5, 0.5*t, 1000)", "a", 0.4 * TIMES)
     for steps in (1, 2, 3):
         ended = found(subject, [0.5], steps=steps)
-        assert ended.place[0] == 0.5
+        assert ended.point[0] == 0.5
         assert ended.evaluations == 1 + 1 + steps * N_TRIED
 
 
@@ -117,7 +117,7 @@ def test_the_slopes_of_a_place_are_taken_once_however_often_steps_from_it_are_re
 def test_a_step_that_a_bound_cuts_off_promises_only_what_is_left_of_it(start: float) -> None:
     ended = found(scored("a", "a", np.full(60, 3.0)), [start], steps=20)
     assert ended.is_converged
-    assert ended.place[0] == start
+    assert ended.point[0] == start
     assert ended.evaluations == 1 + 1
 
 
@@ -130,5 +130,5 @@ def test_how_a_search_is_cut_into_calls_changes_no_bit_of_it(scale: float) -> No
         whole = found(subject, [0.9, 0.1, 0.9, 0.1], scale, steps)
         for at_once in (1, 3):
             cut = found(subject, [0.9, 0.1, 0.9, 0.1], scale, steps, at_once)
-            assert cut.place.tobytes() == whole.place.tobytes()
+            assert cut.point.tobytes() == whole.point.tobytes()
             assert (cut.evaluations, cut.is_converged) == (whole.evaluations, whole.is_converged)

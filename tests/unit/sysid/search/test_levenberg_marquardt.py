@@ -10,7 +10,7 @@ from sysid.search.levenberg_marquardt import (
     form_normal_equations,
     step_aside,
     write_damped_step,
-    write_spread_place,
+    write_spread_point,
 )
 
 POINT = np.array([0.3, 0.6, 0.45])
@@ -105,7 +105,7 @@ def test_spread_places_have_the_covariance_of_the_inverse() -> None:
     factor = factor_damped(matrix, gradient, POINT, 0.0)
     moves, place = [], np.empty(3)
     for deviation in np.eye(3):
-        write_spread_place(factor, POINT, deviation.copy(), place)
+        write_spread_point(factor, POINT, deviation.copy(), place)
         moves.append(place - POINT)
     expected = np.linalg.inv(400.0 * columns @ columns.T)
     np.testing.assert_allclose(np.array(moves).T @ np.array(moves), expected, rtol=1e-9)
