@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from sqlalchemy.orm import Session
 
-from service.core.derived_bodies import read_settings
 from service.core.errors import Conflict
 from service.core.json_pointer import build_run_body
 from service.datasets.recordings import read_records
@@ -17,14 +16,13 @@ from service.datasets.rms_unit import find_rms_unit
 from service.datasets.signal_channels import SignalChannels, map_channels
 from service.jobs.job_parameters import list_job_parameters
 from service.jobs.results import read_noise_model
+from service.jobs.to_core import read_fit, read_noise
 from service.models.models import apply_result, load_stored_model
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.objects import ObjectStore
 from service.storage.tables import Job, Run
-from sysid.core.settings import FitSettings
-from sysid.data.noise import Noise
 from sysid.data.records import Record
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter, override_parameters
@@ -114,7 +112,7 @@ class StoredRun:
             self.read_datasets(session, store, self.body["datasets"]),
             None if others is None else self.read_datasets(session, store, others),
             validation.get("fraction"),
-            read_settings(Noise, self.body["noise"]),
+            read_noise(self.body),
         )
 
     def problem(self, session: Session, store: ObjectStore) -> "Problem":
@@ -126,7 +124,7 @@ class StoredRun:
         parameters = (*self.model.parameters, *build_initial_parameters(self.model, len(records)))
         loss = {**self.body["loss"], "noise_model": read_noise_model(self.result)}
         body = {**self.body, "parameters": self._changes(parameters), "loss": loss}
-        settings, noise = read_settings(FitSettings, body), self.result.get("noise_deviations")
+        settings, noise = read_fit(body), self.result.get("noise_deviations")
         if noise is not None:
             settings = replace(settings, deviations=tuple(map(tuple, noise)))
         return Problem.from_settings(self.model, records, settings)
@@ -149,7 +147,7 @@ class StoredRun:
         model, records = self.model_of_request, self.read_fit_records(session, store)
         substeps = self.result.get("substeps", model.solver.substeps)
         estimates = [to_estimate(document) for document in self.estimates]
-        settings = read_settings(FitSettings, self.body)
+        settings = read_fit(self.body)
         return records, resimulate_run(model, records, settings, estimates, substeps)
 
     def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
