@@ -12,7 +12,7 @@ import httpx
 
 from service.client import calls
 from service.client.calls import RestCall, ServerUnreachable
-from service.client.steps import Item, Steps
+from service.client.steps import AnswerItem, Steps
 
 Answer = TypeVar("Answer")
 
@@ -78,7 +78,7 @@ class Exchange(ABC):
         """Give the answer of a kind: `str`, `bytes`, or else a document of JSON."""
         response = yield from self._send(call)
         form = {str: "text", bytes: "content"}.get(kind)
-        yield Item(getattr(response, form) if form else response.json())
+        yield AnswerItem(getattr(response, form) if form else response.json())
 
     def _iterate(self, call: RestCall[Answer]) -> Steps[Answer]:
         left, position = call.at_most, {"limit": min(call.at_most or PAGE_SIZE, PAGE_SIZE)}
@@ -86,7 +86,7 @@ class Exchange(ABC):
             response = yield from self._send(replace(call, params={**call.params, **position}))
             page = response.json()
             items = page["items"][:left]
-            yield from map(Item, items)
+            yield from map(AnswerItem, items)
             left = None if left is None else left - len(items)
             if page["next"] is None or left == 0:
                 return
@@ -97,7 +97,7 @@ class Exchange(ABC):
         pieces = self._read_pieces(response)
         try:
             while (piece := (yield self._read_next(pieces))) is not None:
-                yield Item(piece)
+                yield AnswerItem(piece)
         except httpx.TransportError as error:
             raise ServerUnreachable(self.url, error) from error
         finally:

@@ -21,7 +21,6 @@ Result = TypeVar("Result")
 Promise = TypeVar("Promise")
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-
 Operation: TypeAlias = Callable[Concatenate[Any, P], RestCall[T]]
 SteppedOperation: TypeAlias = Callable[Concatenate[Any, P], Steps[T]]
 
@@ -88,40 +87,27 @@ class Method(Generic[P, Result, Promise]):
 def fetch(operation: Operation[P, T]) -> Method[P, T, Coroutine[Any, Any, T]]:
     """Make a method that returns the answer of a call: text, bytes, or else what JSON holds."""
     content = _get_content(operation)
-
-    def operate(client: Exchange, /, *arguments: P.args, **options: P.kwargs) -> Steps[T]:
-        return client._fetch(operation(client, *arguments, **options), content)
-
-    return _make_answer(operate, operation, _take_only, content)
+    steps = _follow(operation, lambda client, call: client._fetch(call, content))
+    return _make_answer(steps, operation, _take_only, content)
 
 
 def collect(operation: Operation[P, T]) -> Method[P, Rows[T], Coroutine[Any, Any, Rows[T]]]:
     """Make a method that returns the items of a list."""
-
-    def operate(client: Exchange, /, *arguments: P.args, **options: P.kwargs) -> Steps[T]:
-        return client._iterate(operation(client, *arguments, **options))
-
-    return _make_answer(operate, operation, Rows, GenericAlias(Rows, _get_content(operation)))
+    steps, kind = _follow(operation, Exchange._iterate), GenericAlias(Rows, _get_content(operation))
+    return _make_answer(steps, operation, Rows, kind)
 
 
 def iterate(operation: Operation[P, T]) -> Method[P, Iterator[T], AsyncIterator[T]]:
     """Make a method that iterates over the items of a list, a page at a time."""
-
-    def operate(client: Exchange, /, *arguments: P.args, **options: P.kwargs) -> Steps[T]:
-        return client._iterate(operation(client, *arguments, **options))
-
-    return _make_iterator(operate, operation, _get_content(operation))
+    steps = _follow(operation, Exchange._iterate)
+    return _make_iterator(steps, operation, _get_content(operation))
 
 
 def fetch_pieces(
     operation: Operation[P, bytes],
 ) -> Method[P, Iterator[bytes], AsyncIterator[bytes]]:
     """Make a method that gives a file piece by piece."""
-
-    def operate(client: Exchange, /, *arguments: P.args, **options: P.kwargs) -> Steps[bytes]:
-        return client._download(operation(client, *arguments, **options))
-
-    return _make_iterator(operate, operation, bytes)
+    return _make_iterator(_follow(operation, Exchange._download), operation, bytes)
 
 
 def answer(operation: SteppedOperation[P, T]) -> Method[P, T, Coroutine[Any, Any, T]]:
@@ -132,6 +118,17 @@ def answer(operation: SteppedOperation[P, T]) -> Method[P, T, Coroutine[Any, Any
 def give_each(operation: SteppedOperation[P, T]) -> Method[P, Iterator[T], AsyncIterator[T]]:
     """Make a method that iterates over the items of an operation."""
     return _make_iterator(operation, operation, get_args(_get_content(operation))[0])
+
+
+def _follow(
+    operation: Operation[P, T], give: Callable[[Exchange, RestCall[T]], Steps[T]]
+) -> SteppedOperation[P, T]:
+    """Let an operation go on with the steps that its call needs."""
+
+    def operate(client: Exchange, /, *arguments: P.args, **options: P.kwargs) -> Steps[T]:
+        return give(client, operation(client, *arguments, **options))
+
+    return operate
 
 
 def _make_answer(

@@ -42,7 +42,7 @@ from service.client.methods import (
     iterate,
 )
 from service.client.progress import show_progress
-from service.client.steps import Item, Steps
+from service.client.steps import AnswerItem, Steps
 
 
 class Operations(Exchange):
@@ -51,7 +51,7 @@ class Operations(Exchange):
     @answer
     def send(self, call: RestCall[Any], *, stream: bool = False) -> Steps[httpx.Response]:
         """Send one call and raise its errors. The caller reads and closes a stream."""
-        yield Item((yield from self._send(call, stream)))
+        yield AnswerItem((yield from self._send(call, stream)))
 
     # ---- the server
     @fetch
@@ -300,7 +300,7 @@ class Operations(Exchange):
                 if progress is not None:
                     progress(state)
                 if state["state"] in TERMINAL_STATES:
-                    yield Item(state)
+                    yield AnswerItem(state)
                     return
                 left = start + limit - time.monotonic()
                 if left <= 0:
@@ -328,7 +328,7 @@ class Operations(Exchange):
                 while (line := (yield self._read_next(lines))) is not None:
                     if event := parser.feed_line(line):
                         after, losses, is_over = event["id"], 0, event["event"] == "end"
-                        yield Item(event)
+                        yield AnswerItem(event)
             except httpx.TransportError as error:
                 if losses >= self._retries:
                     raise ServerUnreachable(self.url, error) from error

@@ -12,13 +12,13 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class Item(Generic[T]):
+class AnswerItem(Generic[T]):
     """What an operation gives its caller: one item of many, or its only answer."""
 
     value: T
 
 
-Steps: TypeAlias = Generator[Item[T], Any, None]
+Steps: TypeAlias = Generator[AnswerItem[T], Any, None]
 """An operation under way. All that it yields besides items are steps."""
 
 
@@ -31,7 +31,7 @@ def carry_out(steps: Steps[T]) -> Iterator[T]:
         except StopIteration:
             return
         try:
-            if isinstance(step, Item):
+            if isinstance(step, AnswerItem):
                 yield step.value
                 step = None
         except BaseException as error:  # noqa: BLE001 - raised by the operation
@@ -49,7 +49,7 @@ async def carry_out_awaiting(steps: Steps[T]) -> AsyncIterator[T]:
         except StopIteration:
             return
         try:
-            if isinstance(step, Item):
+            if isinstance(step, AnswerItem):
                 yield step.value
                 result = None
             else:
