@@ -88,7 +88,7 @@ def fetch(operation: Operation[P, T]) -> Method[P, T, Coroutine[Any, Any, T]]:
     """Make a method that returns the answer of a call: text, bytes, or else what JSON holds."""
     content = _get_content(operation)
     steps = _follow(operation, lambda client, call: client._fetch(call, content))
-    return _make_answer(steps, operation, _take_only, content)
+    return _make_answer(steps, operation, _get_only, content)
 
 
 def collect(operation: Operation[P, T]) -> Method[P, Rows[T], Coroutine[Any, Any, Rows[T]]]:
@@ -112,7 +112,7 @@ def fetch_pieces(
 
 def answer(operation: SteppedOperation[P, T]) -> Method[P, T, Coroutine[Any, Any, T]]:
     """Make a method that returns the only item of an operation."""
-    return _make_answer(operation, operation, _take_only, get_args(_get_content(operation))[0])
+    return _make_answer(operation, operation, _get_only, get_args(_get_content(operation))[0])
 
 
 def give_each(operation: SteppedOperation[P, T]) -> Method[P, Iterator[T], AsyncIterator[T]]:
@@ -134,15 +134,15 @@ def _follow(
 def _make_answer(
     operate: SteppedOperation[P, T],
     model: Callable[..., Any],
-    take: Callable[[Iterable[T]], Result],
+    gather: Callable[[Iterable[T]], Result],
     kind: Any,
 ) -> Method[P, Result, Coroutine[Any, Any, Result]]:
     def wait(client: Any, /, *arguments: P.args, **options: P.kwargs) -> Result:
-        return take(carry_out(operate(client, *arguments, **options)))
+        return gather(carry_out(operate(client, *arguments, **options)))
 
     async def await_all(client: Any, /, *arguments: P.args, **options: P.kwargs) -> Result:
         steps = operate(client, *arguments, **options)
-        return take([item async for item in carry_out_awaiting(steps)])
+        return gather([item async for item in carry_out_awaiting(steps)])
 
     return Method(copy_appearance(wait, model, kind), copy_appearance(await_all, model, kind))
 
@@ -170,7 +170,7 @@ def copy_appearance(function: Function, model: Callable[..., Any], kind: Any) ->
     return function
 
 
-def _take_only(items: Iterable[T]) -> T:
+def _get_only(items: Iterable[T]) -> T:
     [only] = items
     return only
 

@@ -99,7 +99,7 @@ class Operations(Exchange):
         self, /, limit: int | None = None, **filters: Any
     ) -> RestCall[documents.DatasetDocument]:
         """Give datasets, latest first: all, or at most `limit`; `name`, `tag` … are filters."""
-        return call("GET /v1/datasets", **filters).take(limit)
+        return call("GET /v1/datasets", **filters).limit_to(limit)
 
     datasets, iterate_datasets = collect(_list_datasets), iterate(_list_datasets)
 
@@ -155,7 +155,7 @@ class Operations(Exchange):
 
     def _list_audit(self, limit: int | None = None) -> RestCall[documents.AuditEntryDocument]:
         """Give who did what in the project, latest first: all, or at most `limit`."""
-        return call("GET /v1/audit").take(limit)
+        return call("GET /v1/audit").limit_to(limit)
 
     audit, iterate_audit = collect(_list_audit), iterate(_list_audit)
 
@@ -164,7 +164,7 @@ class Operations(Exchange):
         self, /, limit: int | None = None, **filters: Any
     ) -> RestCall[documents.ModelDocument]:
         """Give the built-in models and those of users: all, or at most `limit`."""
-        return call("GET /v1/models", **filters).take(limit)
+        return call("GET /v1/models", **filters).limit_to(limit)
 
     models, iterate_models = collect(_list_models), iterate(_list_models)
 
@@ -223,7 +223,7 @@ class Operations(Exchange):
         self, /, limit: int | None = None, state: Sequence[str] | None = None, **filters: Any
     ) -> RestCall[documents.JobDocument]:
         """Give the jobs that pass the filters, latest first: all, or at most `limit`."""
-        return call("GET /v1/jobs", state=state, **filters).take(limit)
+        return call("GET /v1/jobs", state=state, **filters).limit_to(limit)
 
     jobs, iterate_jobs = collect(_list_jobs), iterate(_list_jobs)
 
@@ -345,7 +345,7 @@ class Operations(Exchange):
         self, /, job: str, *, at_most: int | None = None, **filters: Any
     ) -> RestCall[documents.RunDocument]:
         """Give all runs of a job, or the first `at_most` that pass the filters."""
-        return call("GET /v1/jobs/{}/runs", job, **filters).take(at_most)
+        return call("GET /v1/jobs/{}/runs", job, **filters).limit_to(at_most)
 
     iterate_runs = iterate(_list_runs)
     runs = Method(collect(_list_runs).sync, iterate(_list_runs).awaited)
@@ -483,7 +483,7 @@ class Operations(Exchange):
         self, /, limit: int | None = None, **filters: Any
     ) -> RestCall[documents.ReferenceDocument]:
         """Give the references in use, by name: all, or at most `limit`."""
-        return call("GET /v1/references", **filters).take(limit)
+        return call("GET /v1/references", **filters).limit_to(limit)
 
     references, iterate_references = collect(_list_references), iterate(_list_references)
 

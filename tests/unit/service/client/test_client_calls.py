@@ -375,6 +375,24 @@ def test_a_stream_of_the_asynchronous_client_that_is_left_leaves_no_task() -> No
     awaited(work)
 
 
+def test_a_cancelled_download_ends_its_stream() -> None:
+    class Silence(EndlessStream):
+        async def __aiter__(self) -> AsyncIterator[bytes]:
+            yield b"x"
+            await asyncio.Event().wait()
+
+    async def work() -> None:
+        transport = httpx.MockTransport(lambda _: httpx.Response(200, stream=Silence(b"")))
+        async with AsyncClient("http://here", transport=transport) as client:
+            pieces = client.download("ds_1")
+            assert await anext(pieces) == b"x"
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(anext(pieces), 0.01)
+            assert EndlessStream.open == 0
+
+    awaited(work)
+
+
 def test_an_error_at_the_caller_ends_the_stream() -> None:
     with Client("http://here", transport=httpx.MockTransport(give_stream)) as client:
         events: Any = client.events("job_1")
