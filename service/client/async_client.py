@@ -7,16 +7,16 @@ from typing import Any, Self
 
 import httpx
 
-from service.client import calls, operations
+from service.client import calls
 from service.client.calls import RestCall
-from service.client.methods import Awaited, iterate
+from service.client.methods import AsyncFace
 from service.client.operations import Operations
 
 BLOCK_BYTES = 1 << 20
 """Size of the blocks in which a file is read."""
 
 
-class AsyncClient(Awaited, Operations):
+class AsyncClient(AsyncFace, Operations):
     """Asynchronous client of the service; its methods are those of `Client`, with ``await``.
 
     Parameters and errors are those of `Client`. `runs` and `events` are iterated with ``async
@@ -48,9 +48,6 @@ class AsyncClient(Awaited, Operations):
         """Close the connections."""
         await self._http.aclose()
 
-    runs = iterate(operations.runs)
-    """All runs of a job, or the first `at_most` that pass the filters, one after the other."""
-
     async def _send_once(self, call: RestCall[Any], stream: bool) -> httpx.Response:
         content = _read_blocks(call.content) if isinstance(call.content, Path) else call.content
         request = self._http.build_request(**call.request(content))
@@ -68,7 +65,11 @@ class AsyncClient(Awaited, Operations):
     def _read_lines(self, response: httpx.Response) -> AsyncIterator[str]:
         return response.aiter_lines()
 
-    async def _end_stream(self, response: httpx.Response) -> None:
+    async def _read_next(self, parts: AsyncIterator[Any]) -> Any:
+        return await anext(parts, None)
+
+    async def _end_stream(self, response: httpx.Response, parts: Any) -> None:
+        await parts.aclose()
         await response.aclose()
 
 

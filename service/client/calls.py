@@ -165,7 +165,7 @@ class RestCall(Generic[Answer]):
         limit = {} if self.timeout is None else {"timeout": self.timeout}
         return {**request, "params": dict(self.params), "headers": dict(self.headers), **limit}
 
-    def take(self, at_most: int | None) -> "RestCall[Answer]":
+    def limit_to(self, at_most: int | None) -> "RestCall[Answer]":
         """Return the call of a list of which so many items are wanted."""
         return replace(self, at_most=at_most)
 

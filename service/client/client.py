@@ -1,22 +1,20 @@
 """The light client of the service: httpx only, without NumPy or Ray."""
 
 import time
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any, BinaryIO, Self, TypeVar
+from typing import Any, BinaryIO, Self
 
 import httpx
 
-from service.client import calls, operations
+from service.client import calls
 from service.client.calls import RestCall
-from service.client.methods import Waiting, collect
+from service.client.methods import SyncFace
 from service.client.operations import Operations
 
-Piece = TypeVar("Piece")
 
-
-class Client(Waiting, Operations):
+class Client(SyncFace, Operations):
     """Synchronous client of the service.
 
     All methods take and return plain documents with the field names of the REST interface.
@@ -73,10 +71,7 @@ class Client(Waiting, Operations):
         """Close the connections."""
         self._http.close()
 
-    runs = collect(operations.runs)
-    """All runs of a job, or the first `at_most` that pass the filters, as a list."""
-
-    async def _send_once(self, call: RestCall[Any], stream: bool) -> httpx.Response:
+    def _send_once(self, call: RestCall[Any], stream: bool) -> httpx.Response:
         source = call.content
         file: AbstractContextManager[BinaryIO | bytes | None]
         file = source.open("rb") if isinstance(source, Path) else nullcontext(source)
@@ -87,19 +82,18 @@ class Client(Waiting, Operations):
                 response.read()
         return response
 
-    async def _pause(self, seconds: float) -> None:
+    def _pause(self, seconds: float) -> None:
         time.sleep(seconds)
 
-    def _read_pieces(self, response: httpx.Response) -> AsyncIterator[bytes]:
-        return _iterate_at_once(response.iter_bytes())
+    def _read_pieces(self, response: httpx.Response) -> Iterator[bytes]:
+        return response.iter_bytes()
 
-    def _read_lines(self, response: httpx.Response) -> AsyncIterator[str]:
-        return _iterate_at_once(response.iter_lines())
+    def _read_lines(self, response: httpx.Response) -> Iterator[str]:
+        return response.iter_lines()
 
-    async def _end_stream(self, response: httpx.Response) -> None:
+    def _read_next(self, parts: Iterator[Any]) -> Any:
+        return next(parts, None)
+
+    def _end_stream(self, response: httpx.Response, parts: Any) -> None:
+        parts.close()
         response.close()
-
-
-async def _iterate_at_once(pieces: Iterable[Piece]) -> AsyncIterator[Piece]:
-    for piece in pieces:
-        yield piece

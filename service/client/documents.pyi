@@ -89,7 +89,7 @@ class AlgorithmInDocument(TypedDict):
     refine: NotRequired[bool]
     """whether least squares continues from the champions of `improved`"""
     safe_limit: NotRequired[float | None]
-    """RMS error above which a result is not valid (section 3), in the output's unit"""
+    """RMS error above which a result is not valid (section 3 of the paper), in the output's unit"""
     stop: NotRequired[StopInDocument]
     """what ends the search before the last generation, whichever comes first"""
 
@@ -1681,11 +1681,11 @@ class SequenceInDocument(TypedDict):
     """The sequence search."""
 
     kind: NotRequired[Literal["paper", "adaptive"]]
-    """fixed steps (Eq. 11, 12), or least squares over a growing record"""
+    """fixed steps (Eq. 11, 12 of the paper), or least squares over a growing record"""
     beta: NotRequired[float]
     """first step, as a share of the value or of the range"""
     relative: NotRequired[bool]
-    """whether steps are relative to the value (Eq. 12), else to the range"""
+    """whether steps are relative to the value (Eq. 12 of the paper), else to the range"""
 
 class SeriesDocument(TypedDict):
     """One line of a plot, with at most the requested number of points."""

@@ -7,6 +7,7 @@ import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from os import PathLike
 from pathlib import Path
 
 import httpx
@@ -21,13 +22,13 @@ STOP_LIMIT_SECONDS = 20.0
 
 @contextmanager
 def run_embedded_service(
-    data_dir: Path, *, port: int | None = None, cpus: int | None = None
+    data_dir: str | PathLike[str], *, port: int | None = None, cpus: int | None = None
 ) -> Iterator[str]:
     """Start `lagid serve` as a child process, wait until it is ready, and stop it at the end.
 
     Parameters
     ----------
-    data_dir : Path
+    data_dir : str or PathLike
         Folder of database, objects and logs; created if it does not exist.
     port : int, optional
         Port on loopback; a free one by default.
@@ -44,13 +45,14 @@ def run_embedded_service(
     ServiceDidNotStart
         If it ended or was not ready in time; the message quotes the end of its log.
     """
-    data_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+    folder = Path(data_dir)
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     chosen_port = port or find_free_port()
     url = f"http://127.0.0.1:{chosen_port}"
-    command = build_child_command("service.cli.main", "serve", "--data-dir", str(data_dir))
+    command = build_child_command("service.cli.main", "serve", "--data-dir", str(folder))
     command += ["--host", "127.0.0.1", "--port", str(chosen_port)]
     command += ["--cpus", str(cpus)] if cpus else []
-    log = data_dir / "serve.log"
+    log = folder / "serve.log"
     with log.open("ab") as sink:
         child = subprocess.Popen(
             command,

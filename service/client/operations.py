@@ -1,13 +1,13 @@
 """The operations of the REST interface, each once: its call, and how both clients give its answer.
 
 An operation returns the call of a route and the type of its answer. The decorator makes a method
-of it: for `Client` one that waits, for `AsyncClient` one that is awaited. Types are those of
-`service.client.documents`, for editors and type checkers. A slash after `self` leaves all names to
-the filters.
+of it: for `Client` one that waits, for `AsyncClient` one that is awaited. A list has two methods:
+one collects it, one iterates over it. Types are those of `service.client.documents`, for editors
+and type checkers. A slash after `self` leaves all names to the filters.
 """
 
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from http import HTTPStatus
 from math import inf
 from pathlib import Path
@@ -32,24 +32,26 @@ from service.client.calls import (
     call,
 )
 from service.client.exchange import Exchange
-from service.client.methods import Answered, Iterated, collect, fetch, fetch_pieces, iterate
+from service.client.methods import (
+    Method,
+    answer,
+    collect,
+    fetch,
+    fetch_pieces,
+    give_each,
+    iterate,
+)
 from service.client.progress import show_progress
-
-
-def runs(
-    self: Exchange, /, job: str, *, at_most: int | None = None, **filters: Any
-) -> RestCall[documents.RunDocument]:
-    """List all runs of a job, or the first `at_most` that pass the filters."""
-    return call("GET /v1/jobs/{}/runs", job, **filters).take(at_most)
+from service.client.steps import AnswerItem, Steps
 
 
 class Operations(Exchange):
-    """All operations but `runs`, which one client lists and the other iterates over."""
+    """All operations."""
 
-    @Answered
-    async def send(self, call: RestCall[Any], *, stream: bool = False) -> httpx.Response:
+    @answer
+    def send(self, call: RestCall[Any], *, stream: bool = False) -> Steps[httpx.Response]:
         """Send one call and raise its errors. The caller reads and closes a stream."""
-        return await self._send(call, stream)
+        yield AnswerItem((yield from self._send(call, stream)))
 
     # ---- the server
     @fetch
@@ -93,17 +95,13 @@ class Operations(Exchange):
         body = {"name": name, "steps": steps}
         return call("POST /v1/datasets/{}:derive", dataset, json=body)
 
-    @collect
-    def datasets(
+    def _list_datasets(
         self, /, limit: int | None = None, **filters: Any
     ) -> RestCall[documents.DatasetDocument]:
-        """List datasets, newest first: all, or at most `limit`; `name`, `tag` … are filters."""
-        return call("GET /v1/datasets", **filters).take(limit)
+        """Give datasets, latest first: all, or at most `limit`; `name`, `tag` … are filters."""
+        return call("GET /v1/datasets", **filters).limit_to(limit)
 
-    @iterate
-    def iterate_datasets(self, /, **filters: Any) -> RestCall[documents.DatasetDocument]:
-        """Iterate over the datasets that pass the filters, latest first, a page at a time."""
-        return call("GET /v1/datasets", **filters)
+    datasets, iterate_datasets = collect(_list_datasets), iterate(_list_datasets)
 
     @fetch
     def dataset(self, name: str) -> RestCall[documents.DatasetDocument]:
@@ -155,28 +153,20 @@ class Operations(Exchange):
         """Fetch who asks: project and scopes, with the project's limits and use."""
         return call("GET /v1/access")
 
-    @collect
-    def audit(self, limit: int | None = None) -> RestCall[documents.AuditEntryDocument]:
-        """List who did what in the project, latest first: all, or at most `limit`."""
-        return call("GET /v1/audit").take(limit)
+    def _list_audit(self, limit: int | None = None) -> RestCall[documents.AuditEntryDocument]:
+        """Give who did what in the project, latest first: all, or at most `limit`."""
+        return call("GET /v1/audit").limit_to(limit)
 
-    @iterate
-    def iterate_audit(self) -> RestCall[documents.AuditEntryDocument]:
-        """Iterate over who did what in the project, latest first, a page at a time."""
-        return call("GET /v1/audit")
+    audit, iterate_audit = collect(_list_audit), iterate(_list_audit)
 
     # ---- models
-    @collect
-    def models(
+    def _list_models(
         self, /, limit: int | None = None, **filters: Any
     ) -> RestCall[documents.ModelDocument]:
-        """List the built-in models and those of users: all, or at most `limit`."""
-        return call("GET /v1/models", **filters).take(limit)
+        """Give the built-in models and those of users: all, or at most `limit`."""
+        return call("GET /v1/models", **filters).limit_to(limit)
 
-    @iterate
-    def iterate_models(self, /, **filters: Any) -> RestCall[documents.ModelDocument]:
-        """Iterate over the models that pass the filters, a page at a time."""
-        return call("GET /v1/models", **filters)
+    models, iterate_models = collect(_list_models), iterate(_list_models)
 
     @fetch
     def model(self, name: str) -> RestCall[documents.ModelDocument]:
@@ -229,24 +219,19 @@ class Operations(Exchange):
         """Queue a batch re-identification: a run for each value of a label, with a trend."""
         return build_submission("POST /v1/recipes/reidentify", body, idempotency_key)
 
-    @collect
-    def jobs(
+    def _list_jobs(
         self, /, limit: int | None = None, state: Sequence[str] | None = None, **filters: Any
     ) -> RestCall[documents.JobDocument]:
-        """List jobs, newest first: all, at most `limit`, or those that filters select."""
-        return call("GET /v1/jobs", state=state, **filters).take(limit)
+        """Give the jobs that pass the filters, latest first: all, or at most `limit`."""
+        return call("GET /v1/jobs", state=state, **filters).limit_to(limit)
 
-    @iterate
-    def iterate_jobs(
-        self, /, state: Sequence[str] | None = None, **filters: Any
-    ) -> RestCall[documents.JobDocument]:
-        """Iterate over the jobs that pass the filters, latest first, a page at a time."""
-        return call("GET /v1/jobs", state=state, **filters)
+    jobs, iterate_jobs = collect(_list_jobs), iterate(_list_jobs)
 
-    @fetch
-    def job(self, name: str) -> RestCall[documents.JobDocument]:
+    def _call_job(self, name: str) -> RestCall[documents.JobDocument]:
         """Fetch one job with its state and progress."""
         return call("GET /v1/jobs/{}", name)
+
+    job = fetch(_call_job)
 
     @fetch
     def edit_job(
@@ -280,8 +265,8 @@ class Operations(Exchange):
         """Fetch the report of a job, as HTML."""
         return call("GET /v1/jobs/{}/report", job)
 
-    @Answered
-    async def wait(
+    @answer
+    def wait(
         self,
         job: str,
         progress: Callable[[documents.JobDocument], object] | None = None,
@@ -289,7 +274,7 @@ class Operations(Exchange):
         poll: float = POLL_SECONDS,
         timeout: float | None = None,
         bar: bool = False,
-    ) -> documents.JobDocument:
+    ) -> Steps[documents.JobDocument]:
         """Wait until a job has ended; `progress` is called with its state at every poll.
 
         Parameters
@@ -309,19 +294,21 @@ class Operations(Exchange):
         start, limit = time.monotonic(), inf if timeout is None else timeout
         with show_progress(job, is_shown=bar) as advance:
             while True:
-                state: documents.JobDocument = await self._fetch(call("GET /v1/jobs/{}", job))
+                response = yield from self._send(self._call_job(job))
+                state: documents.JobDocument = response.json()
                 advance(state)
                 if progress is not None:
                     progress(state)
                 if state["state"] in TERMINAL_STATES:
-                    return state
+                    yield AnswerItem(state)
+                    return
                 left = start + limit - time.monotonic()
                 if left <= 0:
                     raise WaitTimeout(state, limit)
-                await self._pause(min(poll, left))
+                yield self._pause(min(poll, left))
 
-    @Iterated
-    async def events(self, job: str, after: str | None = None) -> AsyncIterator[Document]:
+    @give_each
+    def events(self, job: str, after: str | None = None) -> Steps[Document]:
         """Yield the events of a job until its end; `after` is the id of the last event received.
 
         After a lost connection, or 45 s without a sign of life, the stream is opened again. It
@@ -335,28 +322,33 @@ class Operations(Exchange):
         losses, is_over = 0, False
         while not is_over:
             parser = EventParser()
-            stream = await self._send(build_event_stream(job, after), stream=True)
+            stream = yield from self._send(build_event_stream(job, after), stream=True)
+            lines = self._read_lines(stream)
             try:
-                async for line in self._read_lines(stream):
+                while (line := (yield self._read_next(lines))) is not None:
                     if event := parser.feed_line(line):
                         after, losses, is_over = event["id"], 0, event["event"] == "end"
-                        yield event
+                        yield AnswerItem(event)
             except httpx.TransportError as error:
                 if losses >= self._retries:
                     raise ServerUnreachable(self.url, error) from error
             finally:
-                await self._end_stream(stream)
+                yield self._end_stream(stream, lines)
             losses += 1
             is_closed = stream.status_code == HTTPStatus.NO_CONTENT  # there is no further event
             is_over = is_over or is_closed or losses > self._retries
             if not is_over:
-                await self._pause(FIRST_PAUSE_SECONDS)
+                yield self._pause(FIRST_PAUSE_SECONDS)
 
     # ---- runs
-    @iterate
-    def iterate_runs(self, /, job: str, **filters: Any) -> RestCall[documents.RunDocument]:
-        """Iterate over the runs of a job that pass the filters, a page at a time."""
-        return call("GET /v1/jobs/{}/runs", job, **filters)
+    def _list_runs(
+        self, /, job: str, *, at_most: int | None = None, **filters: Any
+    ) -> RestCall[documents.RunDocument]:
+        """Give all runs of a job, or the first `at_most` that pass the filters."""
+        return call("GET /v1/jobs/{}/runs", job, **filters).limit_to(at_most)
+
+    iterate_runs = iterate(_list_runs)
+    runs = Method(collect(_list_runs).sync, iterate(_list_runs).awaited)
 
     @fetch
     def summary(
@@ -487,17 +479,13 @@ class Operations(Exchange):
         return call("POST /v1/runs:compare", json={"runs": runs})
 
     # ---- references
-    @collect
-    def references(
+    def _list_references(
         self, /, limit: int | None = None, **filters: Any
     ) -> RestCall[documents.ReferenceDocument]:
-        """List the references in use, by name: all, or at most `limit`."""
-        return call("GET /v1/references", **filters).take(limit)
+        """Give the references in use, by name: all, or at most `limit`."""
+        return call("GET /v1/references", **filters).limit_to(limit)
 
-    @iterate
-    def iterate_references(self, /, **filters: Any) -> RestCall[documents.ReferenceDocument]:
-        """Iterate over the references that pass the filters, by name, a page at a time."""
-        return call("GET /v1/references", **filters)
+    references, iterate_references = collect(_list_references), iterate(_list_references)
 
     @fetch
     def reference(self, name: str) -> RestCall[documents.ReferenceDocument]:

@@ -1,7 +1,8 @@
 """Wire types derived from the settings of the core, and settings read back from documents.
 
 A setting is declared once, in a dataclass of the core: name, type, default, bounds, meaning. Here
-it becomes the field of a body with the same name, default, bounds and sentence.
+it becomes the field of a body with the same name, default, bounds and sentence. A type checker does
+not know the fields that a body derives: what is read are the settings, by `read_settings`.
 """
 
 import re
@@ -15,6 +16,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 import pydantic
 
 from service.core.wire import Body
+from sysid.core.errors import InvalidSettings, join_pointer, suggest_name
 from sysid.core.settings import Bounds, find_bounds, list_members
 
 Settings = TypeVar("Settings")
@@ -51,7 +53,7 @@ def derive_fields(
                 _to_wire_type(hints[field.name], groups, limits.get(field.name, {})),
                 pydantic.Field(
                     default=_to_default(field, groups),
-                    description=describe_settings(kind)[field.name],
+                    description=describe_settings(kind).get(field.name),
                 ),
             )
             for field in fields(kind)
@@ -74,29 +76,35 @@ def take_setting(kind: type, name: str) -> Any:
     bounds = next(filter(None, map(find_bounds, members)), None)
     return pydantic.Field(
         default=_to_default(field, {}),
-        description=describe_settings(kind)[name],
+        description=describe_settings(kind).get(name),
         **_write_bounds(bounds),
     )
 
 
-def read_settings(kind: type[Settings], document: Mapping[str, Any]) -> Settings:
-    """Build settings of the core from the fields of a document that have their names.
+def read_settings(kind: type[Settings], document: Mapping[str, Any], pointer: str = "") -> Settings:
+    """Build settings of the core from a document of them; `pointer` is that of the document.
 
     Raises
     ------
     InvalidSettings
-        With the pointer of the field that cannot be used.
+        With the pointer of the field that cannot be used, or that is unknown.
     """
     hints = get_type_hints(kind)
-    values = {
-        name: _read_value(hint, document[name]) for name, hint in hints.items() if name in document
-    }
+    values = {}
+    for name, value in document.items():
+        place = pointer + join_pointer(name)
+        if name not in hints:
+            raise InvalidSettings(place, f"unknown setting{suggest_name(name, hints)}")
+        values[name] = _read_value(hints[name], value, place)
     return kind(**values)
 
 
 @lru_cache
 def describe_settings(kind: type) -> Mapping[str, str]:
-    """Describe each setting of a dataclass, from its "Attributes", as a wire type does."""
+    """Describe each setting of a dataclass, from its "Attributes", as a wire type does.
+
+    Python started with ``-OO`` has no docstrings, and so no descriptions.
+    """
     section = _ATTRIBUTES.search(getdoc(kind) or "")
     entries = _ENTRY.findall(section[1]) if section else []
     return {name: _to_wire_text(" ".join(text.split())) for name, text in entries}
@@ -134,18 +142,25 @@ def _write_bounds(bounds: Bounds | None) -> dict[str, Any]:
 
 def _to_default(field: "Field[Any]", groups: Mapping[type, type[Body]]) -> Any:
     value = field.default if field.default_factory is MISSING else field.default_factory()
+    if value is MISSING:
+        return ...
     if is_dataclass(value):
         return groups[type(value)]()
     return [*value] if isinstance(value, tuple) else value
 
 
-def _read_value(annotation: Any, value: Any) -> Any:
+def _read_value(annotation: Any, value: Any, pointer: str) -> Any:
     members = list_members(annotation)
-    if isinstance(value, Mapping):
-        kinds: list[Any] = [member for member in members if is_dataclass(member)]
-        return read_settings(kinds[0], value) if kinds else value
+    kinds: list[Any] = [member for member in members if is_dataclass(member)]
+    if kinds and value is not None:
+        if not isinstance(value, Mapping):
+            raise InvalidSettings(pointer, f"found {value!r}; need an object")
+        return read_settings(kinds[0], value, pointer)
     if isinstance(value, list):
-        inner = next(get_args(member) for member in members if get_origin(member) is tuple)
+        inner = next((get_args(one) for one in members if get_origin(one) is tuple), ())
         entries = inner[:1] * len(value) if inner[1:] == (...,) else inner
-        return tuple(map(_read_value, entries, value))
+        if len(entries) != len(value):
+            raise InvalidSettings(pointer, f"found {value!r}; need another kind of value")
+        places = (f"{pointer}/{index}" for index in range(len(value)))
+        return tuple(map(_read_value, entries, value, places))
     return float(value) if float in members and type(value) is int else value

@@ -15,6 +15,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from service.core.documents import to_finite
+from sysid.core.settings import SEED
 
 Item = TypeVar("Item")
 
@@ -105,5 +106,5 @@ class FaultOut(Answer):
     )
 
 
-Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Seed = Annotated[int, Field(ge=SEED.least, lt=SEED.below)]
 Sigma = Annotated[float, Field(ge=0, allow_inf_nan=False)]

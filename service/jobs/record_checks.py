@@ -7,11 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from service.core.derived_bodies import read_settings
 from service.core.errors import FieldError, to_field_errors
 from service.datasets.signal_channels import map_channels
+from service.jobs.to_core import read_algorithm, read_fit
 from sysid.core.errors import RecordTooShort, SysidError, suggest_name
-from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.data.records import find_shared_channels
 from sysid.language.delays import has_varying_delay
 from sysid.models.delays import check_record_length, compute_longest_delay, list_past_values
@@ -183,13 +182,10 @@ def find_weight_count_faults(body: JobBody, experiments: int) -> Iterator[FieldE
 
 
 def find_setting_conflicts(body: JobBody) -> list[FieldError]:
-    """Report settings of search and loss that conflict."""
+    """Report settings of search and fit that conflict."""
     faults: list[FieldError] = []
-    collect_faults(read_settings, faults, GeneticAlgorithm, body["algorithm"])
-    collect_faults(read_settings, faults, Loss, body["loss"])
-    if body["prediction"] == "one-step" and body["loss"]["noise_model"] == "ar1":
-        detail = "ar1 needs prediction: simulation. One-step predictions already contain the noise"
-        faults.append(FieldError("/loss/noise_model", detail))
+    collect_faults(read_algorithm, faults, body)
+    collect_faults(read_fit, faults, body)
     return faults
 
 

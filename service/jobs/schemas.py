@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from service.core.derived_bodies import derive_fields, take_setting
 from service.core.states import StateName
-from service.core.wire import Answer, Body, DescribedBy, Labels, Page, Pointer, Seed
+from service.core.wire import Answer, Body, DescribedBy, Labels, Page, Pointer
 from service.datasets.schemas import NoiseIn
 from service.items.reference_names import REFERENCE_PREFIX, RUN_PREFIX
 from sysid.core.settings import (
@@ -59,12 +59,7 @@ class ValidationIn(Body):
     datasets: list[str] | None = Field(
         default=None, min_length=1, description="datasets that are compared, but not fitted"
     )
-    fraction: float | None = Field(
-        default=None,
-        gt=0,
-        lt=1,
-        description="last part of each record that is compared, but not fitted",
-    )
+    fraction: float | None = take_setting(RunOptions, "validation_fraction")
 
     @model_validator(mode="after")
     def _check_one_source(self) -> Self:
@@ -304,7 +299,7 @@ class JobIn(IdentificationIn):
         default=None, description="data that are compared, but not fitted"
     )
     noise: NoiseIn = Field(default=NoiseIn(), description="noise that is added before fitting")
-    seed: Seed = take_setting(RunOptions, "seed")
+    seed: int = take_setting(RunOptions, "seed")
     sweep: SweepIn = Field(default=SweepIn(), description="fields that change from run to run")
     warm_start: Annotated[str, Field(max_length=300), AfterValidator(_check_warm_start)] | None = (
         Field(

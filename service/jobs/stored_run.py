@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from sqlalchemy.orm import Session
 
-from service.core.derived_bodies import read_settings
 from service.core.errors import Conflict
 from service.core.json_pointer import build_run_body
 from service.datasets.recordings import read_records
@@ -18,14 +17,13 @@ from service.datasets.rms_unit import find_rms_unit
 from service.datasets.signal_channels import SignalChannels, map_channels
 from service.jobs.job_parameters import list_job_parameters
 from service.jobs.results import read_result_document
+from service.jobs.to_core import read_fit, read_noise
 from service.models.models import apply_result, load_stored_model
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.objects import ObjectStore
 from service.storage.tables import Job, Run
-from sysid.core.settings import FitSettings
-from sysid.data.noise import Noise
 from sysid.data.records import Record
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter, override_parameters
@@ -120,7 +118,7 @@ class StoredRun:
             self.read_datasets(session, store, self.body["datasets"]),
             None if others is None else self.read_datasets(session, store, others),
             validation.get("fraction"),
-            read_settings(Noise, self.body["noise"]),
+            read_noise(self.body),
         )
 
     def problem(self, session: Session, store: ObjectStore) -> "Problem":
@@ -133,7 +131,7 @@ class StoredRun:
         result = self.result
         loss = {**self.body["loss"], "noise_model": result.noise_model if result else "white"}
         body = {**self.body, "parameters": self._changes(parameters), "loss": loss}
-        settings = read_settings(FitSettings, body)
+        settings = read_fit(body)
         if result is not None and result.noise_deviations is not None:
             settings = replace(settings, deviations=result.noise_deviations)
         return Problem.from_settings(self.model, records, settings)
@@ -155,7 +153,7 @@ class StoredRun:
 
         model, records = self.model_of_request, self.read_fit_records(session, store)
         substeps = model.solver.substeps if self.result is None else self.result.substeps
-        settings = read_settings(FitSettings, self.body)
+        settings = read_fit(self.body)
         return records, resimulate_run(model, records, settings, self.estimates, substeps)
 
     def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:

@@ -5,6 +5,7 @@ types, and loads no compiler.
 """
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 from service.core.derived_bodies import read_settings
@@ -33,13 +34,29 @@ def read_run_settings(body: Mapping[str, Any], *, in_sweep: bool) -> RunSettings
     """
     compared = body["compare_orders"]
     return RunSettings(
-        read_settings(GeneticAlgorithm, body["algorithm"]),
-        read_settings(FitSettings, body),
+        read_algorithm(body),
+        read_fit(body),
         RunOptions(
             seed=body["seed"],
             validation_fraction=(body["validation"] or {}).get("fraction"),
-            noise=read_settings(Noise, body["noise"]),
+            noise=read_noise(body),
             posterior=body["posterior"],
             compare_orders=not in_sweep if compared is None else compared,
         ),
     )
+
+
+def read_algorithm(body: Mapping[str, Any]) -> GeneticAlgorithm:
+    """Read the settings of the search."""
+    return read_settings(GeneticAlgorithm, body["algorithm"], "/algorithm")
+
+
+def read_fit(body: Mapping[str, Any]) -> FitSettings:
+    """Read the settings of the fit, which are fields of the body itself."""
+    names = [field.name for field in fields(FitSettings) if field.name in body]
+    return read_settings(FitSettings, {name: body[name] for name in names})
+
+
+def read_noise(body: Mapping[str, Any]) -> Noise:
+    """Read the noise that is added before fitting."""
+    return read_settings(Noise, body["noise"], "/noise")

@@ -6,7 +6,7 @@ from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from service.core.derived_bodies import take_setting
-from service.core.wire import Answer, Body, Cell, Seed, Sigma
+from service.core.wire import Answer, Body, Cell, Sigma
 from service.datasets.schemas import MAX_SIMULATED_SAMPLES, InputIn, SampleTime
 from service.jobs.schemas import IdentificationIn, TrendX, ValidationIn
 from sysid.core.settings import SearchMethod
@@ -129,7 +129,7 @@ class ReidentifyIn(IdentificationIn):
     validation: ValidationIn | None = Field(
         default=None, description="data that are compared, but not fitted"
     )
-    seed: Seed = take_setting(RunOptions, "seed")
+    seed: int = take_setting(RunOptions, "seed")
 
     @property
     def job_fields(self) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """Settings of a search and of the problem it solves, as frozen values.
 
 This is their only declaration: name, type, default, bounds, and under "Attributes" what each one
-means. The wire types of the service, its OpenAPI document, the client's types and the table in
-`docs/job.md` are derived from it. So names and sentences here are those of a job.
+means. The wire types of the service, its OpenAPI document, the client's types and the table of the
+search in `docs/job.md` are derived from it. So names and sentences here are those of a job.
 """
 
 from collections.abc import Mapping, Sequence
@@ -95,6 +95,8 @@ Count: TypeAlias = Annotated[int, Bounds(least=1, most=MAX_GENERATIONS)]
 Generation: TypeAlias = Annotated[int, Bounds(least=0, most=MAX_GENERATIONS)]
 Bits: TypeAlias = Annotated[int, Bounds(least=1, most=MAX_BITS)]
 Share: TypeAlias = Annotated[float, Bounds(above=0, below=1)]
+SEED = Bounds(least=0, below=2**63)
+Seed: TypeAlias = Annotated[int, SEED]
 Positive: TypeAlias = Annotated[float, Bounds(above=0)]
 MutationSchedule: TypeAlias = tuple[tuple[Generation, float], ...]
 
@@ -106,11 +108,11 @@ class SequenceSearch:
     Attributes
     ----------
     kind : SequenceKind
-        Fixed steps (Eq. 11, 12), or least squares over a growing record.
+        Fixed steps (Eq. 11, 12 of the paper), or least squares over a growing record.
     beta : float
         First step, as a share of the value or of the range.
     relative : bool
-        Whether steps are relative to the value (Eq. 12), else to the range.
+        Whether steps are relative to the value (Eq. 12 of the paper), else to the range.
 
     Examples
     --------
@@ -260,7 +262,7 @@ class GeneticAlgorithm:
     refine : bool
         Whether least squares continues from the champions of ``improved``.
     safe_limit : float or None
-        RMS error above which a result is not valid (section 3), in the output's unit.
+        RMS error above which a result is not valid (section 3 of the paper), in the output's unit.
     stop : Stop
         What ends the search before the last generation, whichever comes first.
 
@@ -398,8 +400,8 @@ class FitSettings:
         if self.prediction == "one-step" and self.loss.noise_model == "ar1":
             raise InvalidSettings(
                 "/loss/noise_model",
-                f"{self.loss.noise_model} is for free runs; one-step predictions already "
-                "contain the noise",
+                f"{self.loss.noise_model} needs the prediction 'simulation'; one-step predictions "
+                "already contain the noise",
             )
 
 

@@ -29,11 +29,11 @@ class Noise:
     seed : int
         Seed of the noise; the same seed gives the same noise.
     kind : NoiseKind
-        ``uniform-sum``: Eq. 20 with N = `terms`.
+        ``uniform-sum``: Eq. 20 of the paper with N = `terms`.
     terms : int
-        N ≥ 3 of Eq. 20.
+        N ≥ 3 of Eq. 20 of the paper.
     mean : float
-        χ of Eq. 19.
+        χ of Eq. 19 of the paper.
 
     Examples
     --------

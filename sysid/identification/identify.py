@@ -1,7 +1,5 @@
 """Identify a model from records, in this process."""
 
-from __future__ import annotations  # as in `request`, whose fields are in the signature
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -5,6 +5,7 @@ from __future__ import annotations  # as in `request`, whose fields begin with t
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from sysid.core.settings import Seed, Share, check_settings
 from sysid.data.noise import Noise
 
 
@@ -28,9 +29,12 @@ class RunOptions:
         Fit a process with dead time with one order more and one less, too.
     """
 
-    seed: int = 1
-    validation_fraction: float | None = None
+    seed: Seed = 1
+    validation_fraction: Share | None = None
     noise: Noise | None = None
     warm: Mapping[str, float] | None = None
     posterior: bool = False
     compare_orders: bool = True
+
+    def __post_init__(self) -> None:
+        check_settings(self, "")

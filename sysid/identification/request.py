@@ -4,13 +4,13 @@ from __future__ import annotations  # the help of `identify` shows `Data`, not a
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, fields
-from functools import wraps
+from functools import update_wrapper
 from inspect import signature
 from numbers import Integral, Real
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, get_type_hints
 
 from sysid.core.errors import InvalidSettings
-from sysid.core.settings import GeneticAlgorithm, Loss, PredictionKind, Weights
+from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, PredictionKind, Weights
 from sysid.data.holds import HoldSetting
 from sysid.data.noise import Noise
 from sysid.data.records import Channel
@@ -24,6 +24,8 @@ Arguments = ParamSpec("Arguments")
 Request = TypeVar("Request")
 Answer = TypeVar("Answer")
 
+_FIT = FitSettings()
+
 
 @dataclass(frozen=True, slots=True)
 class IdentificationRequest(RunOptions):
@@ -36,10 +38,10 @@ class IdentificationRequest(RunOptions):
     channels: Mapping[str, str] | None = None
     hold: Mapping[str, HoldSetting] | None = None
     parameters: Mapping[str, Change] | None = None
-    prediction: PredictionKind = "simulation"
+    prediction: PredictionKind = _FIT.prediction
     loss: Loss | None = None
-    weights: Weights | None = None
-    skip: int = 0
+    weights: Weights | None = _FIT.weights
+    skip: int = _FIT.skip
     validation: Data | Sequence[Data] | None = None
     progress: Callable[[RunState], None] | None = None
 
@@ -49,6 +51,7 @@ class IdentificationRequest(RunOptions):
                 value = getattr(self, argument.name)
                 if value is not None or argument.default is not None:
                     _check_kind(argument.name, value)
+        RunOptions.__post_init__(self)
 
 
 def _check_kind(name: str, value: object) -> None:
@@ -103,15 +106,22 @@ def accept_fields(
     >>> accept_fields(Loss)(lambda loss: loss.kind)("soft-l1")
     'soft-l1'
     """
+    shown = signature(kind)
 
     def accept(function: Callable[[Request], Answer]) -> Callable[Arguments, Answer]:
-        @wraps(function)
         def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Answer:
+            try:
+                shown.bind(*args, **kwargs)
+            except TypeError as error:
+                raise TypeError(f"{function.__qualname__}() {error}") from None
             return function(kind(*args, **kwargs))
 
-        answer = signature(function).return_annotation
-        vars(call)["__signature__"] = signature(kind).replace(return_annotation=answer)
-        cast(Any, kind).__init__.__qualname__ = function.__qualname__  # errors of a call name it
+        update_wrapper(call, function)
+        del vars(call)["__wrapped__"]  # it has other arguments
+        answer, types = signature(function).return_annotation, get_type_hints(kind)
+        # For people as it is written, such as ``Data``; for programs what that stands for.
+        vars(call)["__signature__"] = shown.replace(return_annotation=answer)
+        call.__annotations__ = {name: types[name] for name in shown.parameters} | {"return": answer}
         return call
 
     return accept

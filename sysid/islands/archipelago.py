@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 from sysid.core.errors import InvalidSettings
-from sysid.core.settings import GeneticAlgorithm
+from sysid.core.settings import SEED, GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.search.archive import make_archive
 from sysid.search.evolution import draw_initial_points
@@ -98,8 +98,8 @@ def create_islands(
     then neighbours of them. The rest is drawn at random. Islands with the improved method also
     share the `starts`, best first. Computing the starts took `spent` simulations.
     """
-    if not 0 <= seed < 2**63:
-        raise InvalidSettings("/seed", f"found {seed!r}. Need a whole number 0 to 2^63 - 1")
+    if not SEED.hold(seed):
+        raise InvalidSettings("/seed", f"found {seed!r}; need {SEED}")
     n = len(problem.free_parameters)
     if n == 0:
         raise InvalidSettings("/parameters", "every parameter is fixed. Leave at least one free")

@@ -177,6 +177,8 @@ def wait(client: Client) -> str:
     assert_type(client.iterate_runs("job_1"), Iterator[RunDocument])
     assert_type(client.events("job_1"), Iterator[dict[str, Any]])
     assert_type(client.report("job_1"), str)
+    assert_type(Client.runs(client, "job_1"), Rows[RunDocument])
+    Client.job(client, 3)  # Argument 2 has incompatible type
     client.wait("job_1", bar="no")  # Argument "bar"
     client.submit()  # Too few arguments
     client.submitted({})  # has no attribute "submitted"
@@ -188,6 +190,7 @@ async def work(client: AsyncClient) -> JobDocument:
     assert_type(await client.jobs(3, state=["failed"], tag="night"), Rows[JobDocument])
     assert_type(client.runs("job_1", at_most=3), AsyncIterator[RunDocument])
     assert_type(client.download("ds_1"), AsyncIterator[bytes])
+    assert_type(AsyncClient.runs(client, "job_1"), AsyncIterator[RunDocument])
     return client.job("job_1")  # Incompatible return value type
 """
 

@@ -306,7 +306,7 @@ def test_identify_samples_the_posterior_as_far_as_the_budget_goes(
         ),
         (
             ["--model", "fopdt", "--noise-model", "ar1", "--set", "prediction=one-step"],
-            "--noise-model: ar1 needs prediction: simulation",
+            "--noise-model: ar1 needs the prediction 'simulation'",
         ),
     ],
 )

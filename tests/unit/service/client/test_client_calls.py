@@ -3,19 +3,23 @@
 import asyncio
 import inspect
 import json
+import pickle
 import re
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import aclosing
 from functools import partial
 from typing import Any
+from unittest.mock import create_autospec
 
 import httpx
 import pytest
 
 from service.api.write_contract import DOCUMENT_FILE
+from service.client import documents
 from service.client.async_client import AsyncClient
 from service.client.calls import ClientError, WaitTimeout, choose_key
 from service.client.client import Client
-from service.client.methods import finish
 from service.client.rows import Rows
 from tests.repository import ROOT
 from tests.rest import awaited
@@ -125,6 +129,8 @@ def test_an_operation_sends_the_same_and_answers_the_same_from_both_clients() ->
 
 
 def test_both_clients_show_what_an_operation_takes_and_gives() -> None:
+    for name in ("job", "jobs", "wait", "iterate_runs", "runs"):
+        assert inspect.getdoc(getattr(Client, name)) == inspect.getdoc(getattr(AsyncClient, name))
     for name in ("job", "jobs", "wait"):
         waiting, twin = getattr(Client, name), getattr(AsyncClient, name)
         assert inspect.signature(waiting) == inspect.signature(twin)
@@ -281,6 +287,152 @@ def test_a_client_that_waits_works_where_a_loop_runs_as_in_a_notebook() -> None:
     assert awaited(work) == [b"0123456789", "x"]
 
 
-def test_a_step_that_waits_is_no_step_of_the_synchronous_client() -> None:
-    with pytest.raises(RuntimeError, match="waited"):
-        finish(asyncio.sleep(0))
+def give_pages(request: httpx.Request) -> httpx.Response:
+    """Four pages of two numbers each, and a file of five pieces."""
+    if request.url.path.endswith(".csv"):
+        return httpx.Response(200, stream=Pieces())
+    number = int(request.url.params.get("cursor", 0))
+    following = str(number + 2) if number < 6 else None
+    return httpx.Response(200, json={"items": [number, number + 1], "next": following})
+
+
+def test_an_iterator_that_was_begun_in_a_loop_goes_on_outside_it() -> None:
+    """A loop closes the asynchronous generators that were begun in it, and so loses the rest."""
+    with Client("http://here", transport=httpx.MockTransport(give_pages)) as client:
+        jobs: Any = client.iterate_jobs()
+        pieces = client.download_runs("job_1")
+
+        async def begin() -> list[Any]:
+            return [next(jobs), next(pieces)]
+
+        assert awaited(begin) == [0, b"0123456789"]
+        assert list(jobs) == [1, 2, 3, 4, 5, 6, 7]
+        assert b"".join(pieces) == b"0123456789" * 4
+
+
+def give_stream(request: httpx.Request) -> httpx.Response:
+    """Events without an end, or a file: as long streams, which are left early."""
+    is_event = request.url.path.endswith("/events")
+    return httpx.Response(200, stream=EndlessStream(b"id: 1\ndata: {}\n\n" if is_event else b"x"))
+
+
+class EndlessStream(httpx.SyncByteStream, httpx.AsyncByteStream):
+    """The same piece again and again."""
+
+    open = 0
+
+    def __init__(self, piece: bytes) -> None:
+        self._piece = piece
+        EndlessStream.open += 1
+
+    def __iter__(self) -> Iterator[bytes]:
+        while True:
+            yield self._piece
+
+    async def __aiter__(self) -> AsyncIterator[bytes]:
+        while True:
+            yield self._piece
+
+    def close(self) -> None:
+        EndlessStream.open -= 1
+
+    async def aclose(self) -> None:
+        self.close()
+
+
+STREAMS = ("download", "download_runs", "events")
+
+
+def test_a_stream_of_the_synchronous_client_that_is_left_leaves_nothing_in_a_loop() -> None:
+    async def work() -> None:
+        begun: list[Any] = []
+        sys.set_asyncgen_hooks(firstiter=begun.append)
+        with Client("http://here", transport=httpx.MockTransport(give_stream)) as client:
+            for name in STREAMS:
+                for _ in getattr(client, name)("x"):
+                    break
+                assert EndlessStream.open == 0
+        assert begun == []
+        await asyncio.sleep(0)
+        assert asyncio.all_tasks() == {asyncio.current_task()}
+
+    awaited(work)
+
+
+def test_a_stream_of_the_asynchronous_client_that_is_left_leaves_no_task() -> None:
+    async def work() -> None:
+        transport = httpx.MockTransport(give_stream)
+        async with AsyncClient("http://here", transport=transport) as client:
+            for name in STREAMS:
+                async with aclosing(getattr(client, name)("x")) as stream:
+                    async for _ in stream:
+                        break
+                assert EndlessStream.open == 0
+                for _ in range(20):  # the loop ends generators of httpx, one inside the other
+                    await asyncio.sleep(0)
+                assert asyncio.all_tasks() == {asyncio.current_task()}
+
+    awaited(work)
+
+
+def test_a_cancelled_download_ends_its_stream() -> None:
+    class Silence(EndlessStream):
+        async def __aiter__(self) -> AsyncIterator[bytes]:
+            yield b"x"
+            await asyncio.Event().wait()
+
+    async def work() -> None:
+        transport = httpx.MockTransport(lambda _: httpx.Response(200, stream=Silence(b"")))
+        async with AsyncClient("http://here", transport=transport) as client:
+            pieces = client.download("ds_1")
+            assert await anext(pieces) == b"x"
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(anext(pieces), 0.01)
+            assert EndlessStream.open == 0
+
+    awaited(work)
+
+
+def test_an_error_at_the_caller_ends_the_stream() -> None:
+    with Client("http://here", transport=httpx.MockTransport(give_stream)) as client:
+        events: Any = client.events("job_1")
+        next(events)
+        with pytest.raises(KeyError, match="mine"):
+            events.throw(KeyError("mine"))
+    assert EndlessStream.open == 0
+
+
+def test_a_mock_of_a_client_has_its_methods() -> None:
+    mock = create_autospec(Client, instance=True)
+    mock.job("x")
+    mock.job.assert_called_once_with("x")
+    with pytest.raises(TypeError, match="unknown"):
+        mock.job("x", unknown=1)
+
+
+@pytest.mark.parametrize("face", [Client, AsyncClient])
+def test_a_class_of_a_client_has_a_function_of_its_own_for_each_method(face: type) -> None:
+    names = [name for name in dir(face) if not name.startswith("_")]
+    for name in names:
+        function = vars(face)[name]
+        assert inspect.isfunction(function)
+        assert (function.__qualname__, function.__module__) == (
+            f"{face.__name__}.{name}",
+            face.__module__,
+        )
+        assert function.__doc__
+
+
+def test_a_client_of_ones_own_may_replace_a_method() -> None:
+    class Mine(Client):
+        def job(self, name: str) -> Any:
+            return super().job(name)["id"]
+
+    with Mine("http://here", transport=httpx.MockTransport(answer_anything)) as client:
+        assert client.job("x") == "x"
+
+
+def test_types_of_answers_are_those_of_the_stub_and_stay_the_same() -> None:
+    assert documents.JobDocument is documents.JobDocument
+    assert pickle.loads(pickle.dumps(documents.JobDocument)) is documents.JobDocument
+    assert not hasattr(documents, "NoSuchDocument")

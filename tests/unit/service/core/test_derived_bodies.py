@@ -1,5 +1,8 @@
 """A setting of the core, declared once: what a body, its schema and its way back make of it."""
 
+import os
+import subprocess
+import sys
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal
 
@@ -13,6 +16,7 @@ from service.core.derived_bodies import (
     take_setting,
 )
 from service.core.wire import Body
+from sysid.core.errors import InvalidSettings
 from sysid.core.settings import (
     Bounds,
     FitSettings,
@@ -25,6 +29,7 @@ from sysid.core.settings import (
 )
 from sysid.data.noise import Noise
 from sysid.identification.options import RunOptions
+from tests.repository import ROOT
 
 
 @dataclass(frozen=True)
@@ -122,10 +127,14 @@ def test_what_the_declaration_or_a_limit_forbids_is_refused(body: dict[str, Any]
         SearchIn.model_validate(body)
 
 
+def dump_settings(body: Body) -> dict[str, Any]:
+    return body.model_dump(mode="json", exclude={"kind_text"})
+
+
 def test_a_body_is_read_back_as_the_settings_it_was_derived_from() -> None:
-    assert read_settings(Search, SearchIn().model_dump(mode="json")) == Search()
+    assert read_settings(Search, dump_settings(SearchIn())) == Search()
     body = SearchIn.model_validate({"cooling": {"rate": 0.25, "start": 3}, "steps": [[4, 1]]})
-    found = read_settings(Search, body.model_dump(mode="json"))
+    found = read_settings(Search, dump_settings(body))
     assert found == Search(cooling=Cooling(0.25, 3), steps=((4, 1.0),))
     assert isinstance(found.steps[0][1], float)
 
@@ -133,6 +142,58 @@ def test_a_body_is_read_back_as_the_settings_it_was_derived_from() -> None:
 def test_whole_numbers_of_a_document_become_those_of_the_setting() -> None:
     """An axis of a sweep may write 1 for 1.0. Both are the same specification."""
     assert repr(read_settings(Stop, {"rms": 1})) == repr(Stop(rms=1.0))
+
+
+@pytest.mark.parametrize(
+    ("kind", "document", "fault"),
+    [
+        (Loss, {"knid": 1}, "/job/knid: unknown setting; did you mean 'kind'?"),
+        (GeneticAlgorithm, {"stop": {"rsm": 1}}, "/job/stop/rsm: unknown setting"),
+        (FitSettings, {"weights": [1, 2]}, r"/job/weights: found \[1, 2\]; need another kind"),
+        (FitSettings, {"loss": 5}, "/job/loss: found 5; need an object"),
+        (Search, {"steps": [[0, 0.1], [1]]}, r"/job/steps/1: found \[1\]; need another kind"),
+        (Search, {"steps": [[0, 1, 2]]}, "/job/steps/0: found"),
+    ],
+)
+def test_what_is_no_document_of_these_settings_is_refused_with_its_place(
+    kind: type, document: dict[str, Any], fault: str
+) -> None:
+    with pytest.raises(InvalidSettings, match=f"^{fault}"):
+        read_settings(kind, document, "/job")
+
+
+def test_a_setting_without_a_default_is_needed() -> None:
+    @dataclass(frozen=True)
+    class Named:
+        """A name.
+
+        Attributes
+        ----------
+        name : str
+            Its name.
+        """
+
+        name: str
+
+    @derive_fields(Named)
+    class NamedIn(Body):
+        """A name."""
+
+    assert NamedIn.model_fields["name"].is_required()
+    assert NamedIn.model_json_schema()["required"] == ["name"]
+
+
+def test_python_without_docstrings_has_bodies_without_descriptions() -> None:
+    code = "from service.jobs.schemas import JobIn; print(JobIn.model_fields['skip'].description)"
+    done = subprocess.run(
+        [sys.executable, "-OO", "-c", code],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.stdout, done.returncode) == ("None\n", 0), done.stderr
 
 
 @pytest.mark.parametrize(
