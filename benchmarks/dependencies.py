@@ -13,7 +13,7 @@ from importlib.metadata import PackageNotFoundError, distribution, metadata
 from typing import Any, cast
 
 from benchmarks.table import Row, Skipped, parser, report
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 LOCK = ROOT / "requirements.lock"
 PERMISSIVE = r"\b(MIT|BSD|Apache|ISC|PSF|MPL|Mozilla)\b"

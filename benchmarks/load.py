@@ -44,7 +44,7 @@ from service.storage.sessions import Database
 from service.storage.tables import Job
 from sysid.core.child_processes import build_child_command
 from sysid.data.records import Recording
-from tests.inline_executor import InlineExecutor
+from tests.support.cluster.inline_executor import InlineExecutor
 
 SIGMAS = [round(0.01 * step, 2) for step in range(1, 11)]
 METHODS = ["simple", "improved"]

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 FOLDER = ROOT / "benchmarks" / "results" / "night"
 

@@ -38,7 +38,7 @@ from service.storage.migrate import upgrade_database
 from service.storage.objects import open_store
 from service.storage.sessions import Database
 from sysid.data.records import Recording
-from tests.inline_executor import InlineExecutor
+from tests.support.cluster.inline_executor import InlineExecutor
 from workers.protocol import (
     CompleteRun,
     Encoder,

@@ -14,19 +14,19 @@ import pytest
 from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
 
-from tests.guard import Guard
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
+from tests.support.session_guard import Guard
 
 pytest_plugins = [
-    "tests.profiles",
-    "tests.database",
-    "tests.stores",
-    "tests.cluster",
-    "tests.compiling",
-    "tests.endless_children",
-    "tests.needs",
-    "tests.patience",
-    "tests.standing",
+    "tests.support.profiles",
+    "tests.support.storage.databases",
+    "tests.support.storage.object_stores",
+    "tests.support.cluster.local_ray",
+    "tests.support.library.local_compilation",
+    "tests.support.endless_children",
+    "tests.support.requirements",
+    "tests.support.service.patience",
+    "tests.support.service.whole_service",
 ]
 
 GUARD = pytest.StashKey[Guard]()
@@ -76,7 +76,11 @@ def find_module_group(module: str) -> str:
     """Find the group of a module: what it shares with others and costs seconds, or itself."""
     path = ROOT / module
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
-    shared = {"tests.standing": "service", "mark.ray": "ray", "mark.browser": "browser"}
+    shared = {
+        "tests.support.service.whole_service": "service",
+        "mark.ray": "ray",
+        "mark.browser": "browser",
+    }
     return next((group for mark, group in shared.items() if mark in text), module)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.dispatching import Place
+from tests.support.cluster.dispatch_place import Place
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from service.queue.leases import LeaseQueue
 from service.queue.notifications import read_queue_status
 from service.repositories.jobs import JobRepository
 from service.storage.tables import Project
-from tests.stored import claim, new_job, submit
+from tests.support.storage.job_rows import claim, new_job, submit
 
 
 def submit_for(database, project, **values):

@@ -36,8 +36,8 @@ from service.storage.tables import (
 from service.upkeep import backup
 from service.upkeep.backup import InvalidBackup, TargetInUse, restore_backup, write_backup
 from tests.contract.test_items import add_dataset, edit, end_job
-from tests.database import KINDS, empty_postgres, empty_sqlite
-from tests.stored import Clock, claim, new_job, parcels_of, submit
+from tests.support.storage.databases import KINDS, empty_postgres, empty_sqlite
+from tests.support.storage.job_rows import Clock, claim, new_job, parcels_of, submit
 
 Rows = dict[str, list[tuple[Any, ...]]]
 
@@ -62,7 +62,7 @@ def store(tmp_path: Path) -> ObjectStore:
 
 
 @pytest.fixture
-def filled(database: Database, store: ObjectStore) -> Database:
+def database_with_rows(database: Database, store: ObjectStore) -> Database:
     """A database with rows of many tables, and the objects that they name."""
     sha256 = store.put_stream([b"recording" * 1000]).sha256
     data = add_dataset(database, name="größe [m³]", sha256=sha256)
@@ -91,14 +91,14 @@ def target(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]
 
 
 def test_a_restored_place_has_the_same_rows_and_objects(
-    filled: Database, store: ObjectStore, target: Database, tmp_path: Path
+    database_with_rows: Database, store: ObjectStore, target: Database, tmp_path: Path
 ) -> None:
     """Also from one kind of database into the other."""
     file, other = tmp_path / "b.zip", open_store(f"file://{tmp_path}/other")
-    written = write_backup(filled, store, file)
+    written = write_backup(database_with_rows, store, file)
     assert file.stat().st_mode & 0o777 == 0o600
     assert restore_backup(target, other, file) == written
-    assert read_rows(target) == read_rows(filled)
+    assert read_rows(target) == read_rows(database_with_rows)
     assert read_objects(other) == read_objects(store)
     assert migrate.list_differences(target) == []
     with target.read_session() as session:
@@ -168,13 +168,16 @@ def test_a_backup_goes_from_a_folder_into_a_bucket_and_back(
 
 
 def test_a_backup_is_one_state_although_others_write_meanwhile(
-    filled: Database, store: ObjectStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    database_with_rows: Database,
+    store: ObjectStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    before, write_table = read_rows(filled), backup._write_table
+    before, write_table = read_rows(database_with_rows), backup._write_table
 
     def write_and_let_others_submit(*parts: Any) -> dict[str, Any]:
         def submit() -> None:
-            with filled.write_session() as session:
+            with database_with_rows.write_session() as session:
                 JobRepository(session).submit(new_job("late", {}))
 
         thread = threading.Thread(target=submit)
@@ -183,17 +186,17 @@ def test_a_backup_is_one_state_although_others_write_meanwhile(
         return write_table(*parts)
 
     monkeypatch.setattr(backup, "_write_table", write_and_let_others_submit)
-    report = write_backup(filled, store, tmp_path / "b.zip")
+    report = write_backup(database_with_rows, store, tmp_path / "b.zip")
     monkeypatch.undo()
-    assert read_rows(filled) != before
+    assert read_rows(database_with_rows) != before
     assert report.rows == {name: len(rows) for name, rows in before.items()}
 
 
 def test_a_place_with_rows_or_objects_is_refused_without_force(
-    filled: Database, store: ObjectStore, target: Database, tmp_path: Path
+    database_with_rows: Database, store: ObjectStore, target: Database, tmp_path: Path
 ) -> None:
     file = tmp_path / "b.zip"
-    write_backup(filled, store, file)
+    write_backup(database_with_rows, store, file)
     with pytest.raises(TargetInUse, match=r"store is not empty.*--force"):
         restore_backup(target, store, file)
     other = open_store(f"file://{tmp_path}/other")
@@ -203,7 +206,7 @@ def test_a_place_with_rows_or_objects_is_refused_without_force(
     with pytest.raises(TargetInUse, match=r"rows in .*jobs.*--force"):
         restore_backup(target, open_store(f"file://{tmp_path}/empty"), file)
     restore_backup(target, other, file, force=True)
-    assert read_rows(target) == read_rows(filled)
+    assert read_rows(target) == read_rows(database_with_rows)
     with target.write_session() as session:
         DispatcherRepository(session).add_dispatcher("d2", {LEASE_SECONDS_KEY: 30.0})
     with pytest.raises(TargetInUse, match="dispatcher d2"):
@@ -211,21 +214,21 @@ def test_a_place_with_rows_or_objects_is_refused_without_force(
 
 
 def test_a_backup_of_an_earlier_revision_is_upgraded(
-    filled: Database,
+    database_with_rows: Database,
     store: ObjectStore,
     target: Database,
     tmp_path: Path,
     add_revision: Callable[..., None],
 ) -> None:
     file, other = tmp_path / "b.zip", open_store(f"file://{tmp_path}/other")
-    write_backup(filled, store, file)
+    write_backup(database_with_rows, store, file)
     add_revision()
     restore_backup(target, other, file)
     migrate.check_revision(target)
-    assert read_rows(target) == read_rows(filled)
+    assert read_rows(target) == read_rows(database_with_rows)
     restore_backup(target, other, file, force=True)  # the place has the later tables now
     migrate.check_revision(target)
-    assert read_rows(target) == read_rows(filled)
+    assert read_rows(target) == read_rows(database_with_rows)
 
 
 def damage(file: Path, name: str, content: bytes | None) -> None:

@@ -10,15 +10,15 @@ from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.errors import RowConflict, RowNotFound
-from tests.stored import (
+from tests.support.storage.job_rows import (
     claim,
-    claimed,
     job_of,
     record_outcomes,
     record_success,
     runs_of,
     state_of,
     submit,
+    submit_and_claim,
 )
 
 
@@ -35,7 +35,7 @@ def test_a_queued_job_is_cancelled_at_once(database):
 
 
 def test_a_running_job_goes_on_until_its_dispatcher_cancels_it(database):
-    got, _ = claimed(database)
+    got, _ = submit_and_claim(database)
     with database.write_session() as session:
         job = JobRepository(session).cancel(got.job.id)
         assert (job.state, job.cancel_requested) == (JobState.RUNNING, True)
@@ -92,7 +92,7 @@ def cancel_resumed(database, lease):
     ],
 )
 def test_a_job_that_ends_early_has_the_results_of_its_best_run(database, ways, state):
-    got, runs = claimed(database, n_runs=3, max_attempts=1)
+    got, runs = submit_and_claim(database, n_runs=3, max_attempts=1)
     for run, rms, trust in zip(runs, (0.5, 0.4), ("trustworthy", "limited"), strict=False):
         outcome = RunOutcome(
             run_id=run,
@@ -109,7 +109,7 @@ def test_a_job_that_ends_early_has_the_results_of_its_best_run(database, ways, s
 
 
 def test_of_two_wishes_to_cancel_the_first_gives_the_reason(database):
-    got, _ = claimed(database)
+    got, _ = submit_and_claim(database)
     for reason in ("as told", None):
         with database.write_session() as session:
             JobRepository(session).cancel(got.job.id, reason)
@@ -126,7 +126,7 @@ def test_cancelling_twice_is_as_cancelling_once(database):
 
 @pytest.mark.parametrize("end", [JobState.SUCCEEDED, JobState.FAILED])
 def test_a_finished_job_cannot_be_cancelled(database, end):
-    got, (run_id,) = claimed(database)
+    got, (run_id,) = submit_and_claim(database)
     with database.write_session() as session:
         RunWriter(session, got.lease).record_outcomes([RunOutcome(run_id=run_id, state=end)])
         LeaseQueue(session).finish_job(got.lease, end)
@@ -155,7 +155,7 @@ def test_cancel_and_claim_at_once_never_lose_the_wish(database):
 
 def test_cancel_and_finish_at_once_end_in_one_state_and_one_end_event(database):
     for _ in range(8):
-        got, (run_id,) = claimed(database)
+        got, (run_id,) = submit_and_claim(database)
         start = threading.Barrier(2)
 
         def cancel(job_id=got.job.id, start=start):
@@ -183,7 +183,7 @@ def test_cancel_and_finish_at_once_end_in_one_state_and_one_end_event(database):
 
 
 def test_a_resumed_job_runs_again_only_what_did_not_succeed(database):
-    got, (done, bad, _) = claimed(database, n_runs=3)
+    got, (done, bad, _) = submit_and_claim(database, n_runs=3)
     with database.write_session() as session:
         RunWriter(session, got.lease).record_outcomes(
             [
@@ -204,12 +204,12 @@ def test_a_resumed_job_runs_again_only_what_did_not_succeed(database):
 
 
 def test_a_resumed_job_begins_with_a_clean_slate_and_leaves_other_jobs_alone(database):
-    other, (foreign,) = claimed(database)
+    other, (foreign,) = submit_and_claim(database)
     record_success(database, other.lease, foreign, 0.1)
-    running, (runs_on,) = claimed(database)
+    running, (runs_on,) = submit_and_claim(database)
     with database.write_session() as session:
         RunWriter(session, running.lease).start_runs([runs_on])
-    got, (run_id,) = claimed(database, max_attempts=2)
+    got, (run_id,) = submit_and_claim(database, max_attempts=2)
     with database.write_session() as session:
         RunWriter(session, got.lease).write_kills({run_id: 1})
     for _ in range(2):  # the dispatcher loses its workers twice, and gives up

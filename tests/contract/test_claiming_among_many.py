@@ -16,14 +16,14 @@ from service.queue.notifications import read_queue_status
 from service.repositories.jobs import JobRepository
 from service.storage.columns import utc_now
 from service.storage.tables import Job, Parcel, Project
-from tests.stored import claimed
+from tests.support.storage.job_rows import submit_and_claim
 
 PROJECTS = [f"p{number}" for number in range(4)]
 N_ENDED, N_QUEUED, N_RUNNING = 4000, 400, 128
 
 
 @pytest.fixture(scope="module")
-def crowded(module_database):
+def crowded_database(module_database):
     """A database with thousands of ended jobs, hundreds of queued ones, and many that run."""
     return add_crowd(module_database)
 
@@ -104,25 +104,25 @@ def claim(database, admission=None):
 
 
 @pytest.mark.parametrize("admission", [None, Admission(8, 0)], ids=["all", "short"])
-def test_a_claim_scans_no_table_and_counts_running_jobs_once(crowded, admission) -> None:
-    plans = plans_of(crowded, lambda: claim(crowded, admission))
+def test_a_claim_scans_no_table_and_counts_running_jobs_once(crowded_database, admission) -> None:
+    plans = plans_of(crowded_database, lambda: claim(crowded_database, admission))
     assert plans
-    whole = "SCAN jobs" if crowded.is_sqlite else "Seq Scan on jobs"
+    whole = "SCAN jobs" if crowded_database.is_sqlite else "Seq Scan on jobs"
     assert not [plan for plan in plans if whole in plan], plans
     assert not [plan for plan in plans if "CORRELATED" in plan or "SubPlan" in plan], plans
-    if crowded.is_sqlite:
+    if crowded_database.is_sqlite:
         assert "COVERING INDEX ix_jobs_open" in plans[0]
 
 
-def test_a_look_at_the_queue_scans_no_table(crowded) -> None:
+def test_a_look_at_the_queue_scans_no_table(crowded_database) -> None:
     def work() -> None:
-        with crowded.read_session() as session:
+        with crowded_database.read_session() as session:
             read_queue_status(session, "d1")
 
-    plans = plans_of(crowded, work)
+    plans = plans_of(crowded_database, work)
     assert len(plans) == 2
     for plan in plans:
-        wanted = "COVERING INDEX" if crowded.is_sqlite else "Index"
+        wanted = "COVERING INDEX" if crowded_database.is_sqlite else "Index"
         assert wanted in plan, plans
         assert "Seq Scan" not in plan, plans
 
@@ -142,11 +142,11 @@ def test_a_claim_reads_each_running_job_once_and_not_for_every_waiting_one(crowd
     assert 100 * steps < 100 * (N_QUEUED + N_RUNNING)
 
 
-def test_a_project_that_has_nothing_running_comes_first_among_many(crowded) -> None:
-    with crowded.write_session() as session:
+def test_a_project_that_has_nothing_running_comes_first_among_many(crowded_database) -> None:
+    with crowded_database.write_session() as session:
         session.execute(text("UPDATE jobs SET project_id = 'p3' WHERE id = 'job_04399'"))
-    first = claim(crowded)
-    assert job_of_project(crowded, first) == "p3"
+    first = claim(crowded_database)
+    assert job_of_project(crowded_database, first) == "p3"
 
 
 def statements_of(database, work) -> list[str]:
@@ -168,7 +168,7 @@ def statements_of(database, work) -> list[str]:
 def test_a_job_that_is_held_told_of_reaped_or_watched_does_not_bring_its_specification(
     database,
 ) -> None:
-    got, _ = claimed(database)
+    got, _ = submit_and_claim(database)
 
     def work() -> None:
         with database.write_session() as session:

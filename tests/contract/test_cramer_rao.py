@@ -12,8 +12,8 @@ from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.leases import HeldLeases
 from service.sweeps.cramer_rao import StoredBounds
 from sysid.uncertainty.cramer_rao import cramer_rao_bound
-from tests.inline_executor import InlineExecutor
-from tests.limits import LIMIT_SECONDS
+from tests.support.cluster.inline_executor import InlineExecutor
+from tests.support.limits import LIMIT_SECONDS
 
 pytestmark = pytest.mark.slow
 
@@ -21,7 +21,7 @@ SMALL = {"population": 8, "generations": 3, "islands": 1, "refine": False}
 NOISY = {"algorithm": SMALL, "noise": {"sigma": 0.1}}
 
 
-def carried_out(place, *jobs, meanwhile=lambda: None):
+def carry_out_jobs(place, *jobs, meanwhile=lambda: None):
     """Carry out jobs; `meanwhile` is called in another thread."""
     dispatcher = Dispatcher(
         place.database, place.store, InlineExecutor(), HeldLeases(place.database, 30)
@@ -42,7 +42,7 @@ def carried_out(place, *jobs, meanwhile=lambda: None):
     return [place.job(job) for job in jobs]
 
 
-def notes(job):
+def list_notes(job):
     return list(StoredBounds(job.cramer_rao).list_notes())
 
 
@@ -50,12 +50,12 @@ def test_other_jobs_are_carried_out_while_bounds_are_computed(place, monkeypatch
     may_go_on, begun = threading.Event(), threading.Event()
     made = cramer_rao_bound
 
-    def held(problem, theta):
+    def wait_and_compute(problem, theta):
         begun.set()
         assert may_go_on.wait(LIMIT_SECONDS)
         return made(problem, theta)
 
-    monkeypatch.setattr(cramer_rao, "cramer_rao_bound", held)
+    monkeypatch.setattr(cramer_rao, "cramer_rao_bound", wait_and_compute)
     noisy = place.submit(**NOISY)
     states = []
 
@@ -66,7 +66,7 @@ def test_other_jobs_are_carried_out_while_bounds_are_computed(place, monkeypatch
         states.append(place.job(noisy).state)
         may_go_on.set()
 
-    (job,) = carried_out(place, noisy, meanwhile=meanwhile)
+    (job,) = carry_out_jobs(place, noisy, meanwhile=meanwhile)
     assert states == [JobState.SUCCEEDED, JobState.RUNNING]
     assert job.state is JobState.SUCCEEDED
     assert job.cramer_rao["problems"][0]["stderr"]["T"] > 0
@@ -75,12 +75,12 @@ def test_other_jobs_are_carried_out_while_bounds_are_computed(place, monkeypatch
 def test_a_job_is_cancelled_while_its_bounds_are_computed(place, monkeypatch):
     may_go_on, begun = threading.Event(), threading.Event()
 
-    def held(problem, theta):
+    def wait_and_compute(problem, theta):
         begun.set()
         assert may_go_on.wait(LIMIT_SECONDS)
         raise ZeroDivisionError
 
-    monkeypatch.setattr(cramer_rao, "cramer_rao_bound", held)
+    monkeypatch.setattr(cramer_rao, "cramer_rao_bound", wait_and_compute)
     noisy = place.submit(**NOISY)
 
     def meanwhile():
@@ -89,7 +89,7 @@ def test_a_job_is_cancelled_while_its_bounds_are_computed(place, monkeypatch):
         place.until(noisy, JobState.CANCELLED)
         may_go_on.set()
 
-    (job,) = carried_out(place, noisy, meanwhile=meanwhile)
+    (job,) = carry_out_jobs(place, noisy, meanwhile=meanwhile)
     assert job.state is JobState.CANCELLED
     assert job.cramer_rao is None
     assert {run.state for run in place.runs(noisy)} == {JobState.SUCCEEDED}
@@ -101,17 +101,17 @@ def test_an_error_of_the_numerics_is_a_note_and_the_job_succeeds(place, monkeypa
         raise error
 
     monkeypatch.setattr(cramer_rao, "cramer_rao_bound", broken)
-    (job,) = carried_out(place, place.submit(**NOISY))
+    (job,) = carry_out_jobs(place, place.submit(**NOISY))
     assert job.state is JobState.SUCCEEDED
-    assert any("no Cramér–Rao bound: internal error" in one for one in notes(job))
+    assert any("no Cramér–Rao bound: internal error" in one for one in list_notes(job))
 
 
 def test_of_more_problems_than_bounds_are_computed_of_a_note_tells(place, monkeypatch):
     monkeypatch.setattr(cramer_rao, "MAX_PROBLEMS", 2)
-    (few,) = carried_out(place, place.submit(**NOISY, sweep={"axes": [SKIPS[0]]}))
-    (many,) = carried_out(place, place.submit(**NOISY, sweep={"axes": [SKIPS[1]]}))
+    (few,) = carry_out_jobs(place, place.submit(**NOISY, sweep={"axes": [SKIPS[0]]}))
+    (many,) = carry_out_jobs(place, place.submit(**NOISY, sweep={"axes": [SKIPS[1]]}))
     assert [len(job.cramer_rao["problems"]) for job in (few, many)] == [2, 2]
-    assert [cramer_rao.LEFT_OUT_NOTE in notes(job) for job in (few, many)] == [False, True]
+    assert [cramer_rao.LEFT_OUT_NOTE in list_notes(job) for job in (few, many)] == [False, True]
 
 
 SKIPS = [{"path": "/skip", "values": [1, 2]}, {"path": "/skip", "values": [1, 2, 3]}]

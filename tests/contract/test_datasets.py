@@ -10,7 +10,7 @@ from service.repositories.datasets import DatasetRepository
 from service.repositories.lineage import LineageLink, LineageRepository
 from service.repositories.models import ModelRepository
 from service.storage.errors import RowNotFound
-from tests.stored import Clock, new_dataset
+from tests.support.storage.job_rows import Clock, new_dataset
 
 
 def add(database, parents=(), **values):

@@ -17,9 +17,9 @@ from service.core.settings import Settings
 from service.dispatch import start
 from service.queue.dispatchers import DispatcherRepository, describe_start
 from service.storage.sessions import Database
-from tests.commands import check_refusal, run_lagid
-from tests.rest import settings_of
-from tests.serving import serve_in_thread
+from tests.support.service.commands import check_refusal, run_lagid
+from tests.support.service.web_app import settings_of
+from tests.support.service.web_server import serve_in_thread
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from service.dispatch.job_runs import JobRuns
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunWriter
 from tests.contract.test_leases import Stand, leases_of
-from tests.stored import Clock
+from tests.support.storage.job_rows import Clock
 from workers.protocol import QueuedRun
 
 SWEEP = {"axes": [{"path": "/seed", "range": [0, dispatcher.SHORT_RUNS + 1]}]}

@@ -29,7 +29,14 @@ from service.repositories.summaries import read_run_table
 from service.storage.errors import RowNotFound
 from service.storage.sessions import Database, SessionOwner
 from service.storage.tables import DEFAULT_PROJECT, Run, SearchTerm, StoredSummary
-from tests.stored import claimed, job_of, new_dataset, new_job, runs_of, submit
+from tests.support.storage.job_rows import (
+    job_of,
+    new_dataset,
+    new_job,
+    runs_of,
+    submit,
+    submit_and_claim,
+)
 
 
 def spec_of(dataset: str = "ds_1", **changes: Any) -> dict[str, Any]:
@@ -60,7 +67,7 @@ def end_job(
     database: Database, states: tuple[JobState, ...], **changes: Any
 ) -> tuple[str, list[str]]:
     """An ended job whose runs have these states."""
-    claim, runs = claimed(database, n_runs=len(states), spec=spec_of(**changes))
+    claim, runs = submit_and_claim(database, n_runs=len(states), spec=spec_of(**changes))
     end = JobState.SUCCEEDED
     with database.write_session() as session:
         store_job_links(session, claim.job)

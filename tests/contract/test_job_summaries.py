@@ -19,11 +19,11 @@ from service.storage.sessions import Database
 from service.storage.tables import StoredSummary
 from service.sweeps import job_summary, summary
 from service.sweeps.schemas import SummaryOut
-from tests.database import record_statements
-from tests.dispatching import Place
-from tests.limits import LIMIT_SECONDS
-from tests.results import claim_job, conclude, write_results
-from tests.stored import record_outcomes
+from tests.support.cluster.dispatch_place import Place
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.storage.databases import record_statements
+from tests.support.storage.job_rows import record_outcomes
+from tests.support.storage.run_results import claim_job, conclude, write_results
 
 AXES = [{"path": "/noise/sigma", "values": [0.1, 0.2]}, {"path": "/seed", "range": [0, 4]}]
 CRAMER_RAO = {
@@ -122,7 +122,7 @@ def test_a_summary_of_an_ended_job_is_computed_again_after_it_was_resumed(place:
     assert [group.succeeded for group in summarise(place, job).groups] == [4, 4]
 
 
-def ended(place: Place) -> tuple[str, Lease, list[str]]:
+def end_noise_sweep(place: Place) -> tuple[str, Lease, list[str]]:
     """A noise sweep whose runs have ended: one failed, the others with different estimates."""
     job, lease, runs = swept(place)
     results = {run: conclude(L=(0.5 + 0.01 * n, 0.1 + 0.1 * n)) for n, run in enumerate(runs[1:])}
@@ -148,7 +148,7 @@ def test_readers_that_hold_all_connections_get_and_store_one_summary(
     stored_place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """None of them may wait for the one that computes, and hold what it needs to store."""
-    job, lease, _ = ended(stored_place)
+    job, lease, _ = end_noise_sweep(stored_place)
     finish(stored_place, lease)
     url = stored_place.database.engine.url.render_as_string(hide_password=False)
     few = Database(url, pool_size=2, max_overflow=0, pool_timeout=LIMIT_SECONDS)
@@ -171,7 +171,7 @@ def test_a_dispatcher_stores_what_the_first_reader_would_compute(
     stored_place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place = stored_place
-    job, lease, _ = ended(place)
+    job, lease, _ = end_noise_sweep(place)
     claim = Claim(lease, place.job(job), range(place.job(job).n_runs))
     maker = job_end.build_end_maker(
         place.database, claim.lease, JobRuns(place.database, claim, place.store).parts
@@ -192,7 +192,7 @@ def test_a_dispatcher_stores_what_the_first_reader_would_compute(
 def test_the_first_reader_of_an_ended_job_stores_what_it_has_computed(
     stored_place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job, lease, _ = ended(stored_place)
+    job, lease, _ = end_noise_sweep(stored_place)
     finish(stored_place, lease, JobState.CANCELLED)
     first = summarise(stored_place, job)
     forget(monkeypatch)
@@ -200,7 +200,7 @@ def test_the_first_reader_of_an_ended_job_stores_what_it_has_computed(
 
 
 def test_nothing_is_stored_of_a_job_that_runs_or_was_lost(stored_place: Place) -> None:
-    job, lease, _ = ended(stored_place)
+    job, lease, _ = end_noise_sweep(stored_place)
     summarise(stored_place, job)
     with pytest.raises(LeaseLost):
         job_summary.store_summary(stored_place.database, Lease(job, lease.attempt + 1, "late"))
@@ -211,7 +211,7 @@ def test_nothing_is_stored_of_a_job_that_runs_or_was_lost(stored_place: Place) -
 def test_what_was_stored_of_a_job_is_forgotten_when_it_is_resumed(
     stored_place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job, lease, _ = ended(stored_place)
+    job, lease, _ = end_noise_sweep(stored_place)
     finish(stored_place, lease, JobState.FAILED)
     assert summarise(stored_place, job).groups[0].failed == 1
     with stored_place.database.write_session() as session:
@@ -255,7 +255,7 @@ def test_a_summary_that_takes_long_is_used_again_while_the_job_runs(
 def test_readers_that_come_at_once_compute_a_summary_once(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job, lease, _ = ended(place)
+    job, lease, _ = end_noise_sweep(place)
     finish(place, lease)
     with record_statements(place.database) as statements, ThreadPoolExecutor(4) as pool:
         told = list(pool.map(lambda _: summarise(place, job), range(8)))

@@ -23,19 +23,27 @@ from service.storage.errors import (
     UnstorableValue,
 )
 from service.storage.tables import Job, Project, Run
-from tests.database import record_statements
-from tests.stored import claim, claimed, job_of, new_job, record_outcomes, runs_of, submit
+from tests.support.storage.databases import record_statements
+from tests.support.storage.job_rows import (
+    claim,
+    job_of,
+    new_job,
+    record_outcomes,
+    runs_of,
+    submit,
+    submit_and_claim,
+)
 
 NEW = new_job(name="tube 40 m", spec={"model": "tube", "sweep": {"axes": []}}, n_runs=3)
 
 
-def events(database, job_id, after=0, limit=500):
+def list_events(database, job_id, after=0, limit=500):
     with database.read_session() as session:
         return EventRepository(session).list_after(job_id, after, limit)
 
 
 def kinds(database, job_id):
-    return [(event.kind, event.data.get("state")) for event in events(database, job_id)]
+    return [(event.kind, event.data.get("state")) for event in list_events(database, job_id)]
 
 
 def test_a_submitted_job_is_queued_and_kept_whole(database):
@@ -128,7 +136,7 @@ def end_with_fit(database, name, *fits, cell=None, trust=None):
     results = [
         None if one is None else {"parameters": [], "verdict": {"trust": one}} for one in each
     ]
-    ended, runs = claimed(database, n_runs=len(fits), name=name)
+    ended, runs = submit_and_claim(database, n_runs=len(fits), name=name)
     record_outcomes(
         database,
         ended.lease,
@@ -322,7 +330,7 @@ def test_a_name_that_not_every_database_can_keep_is_refused(database, name):
 
 
 def test_a_job_tells_its_whole_story(database):
-    got, (run_id,) = claimed(database)
+    got, (run_id,) = submit_and_claim(database)
     with database.write_session() as session:
         queue = LeaseQueue(session)
         queue.append_event(got.lease, "log", {"line": "packing 1 run"})
@@ -350,24 +358,24 @@ def test_a_resumed_job_tells_on_after_its_end(database):
 
 
 def test_a_reader_goes_on_after_the_last_event_it_saw(database):
-    got, _ = claimed(database)
-    other, _ = claimed(database)
+    got, _ = submit_and_claim(database)
+    other, _ = submit_and_claim(database)
     for i in range(5):
         with database.write_session() as session:
             LeaseQueue(session).append_event(got.lease, "log", {"line": i})
             LeaseQueue(session).append_event(other.lease, "log", {"line": -i})
-    everything = events(database, got.job.id)
+    everything = list_events(database, got.job.id)
     ids = [event.id for event in everything]
     assert ids == sorted(set(ids))
-    first = events(database, got.job.id, limit=3)
-    rest = events(database, got.job.id, after=first[-1].id)
+    first = list_events(database, got.job.id, limit=3)
+    rest = list_events(database, got.job.id, after=first[-1].id)
     assert [event.id for event in first + rest] == ids
     assert [event.data["line"] for event in rest] == [1, 2, 3, 4]
 
 
 def test_an_event_is_never_seen_before_one_with_a_smaller_number(database):
-    got, _ = claimed(database)
-    before = len(events(database, got.job.id))
+    got, _ = submit_and_claim(database)
+    before = len(list_events(database, got.job.id))
 
     def write(line):
         with database.write_session() as session:
@@ -378,14 +386,14 @@ def test_an_event_is_never_seen_before_one_with_a_smaller_number(database):
         quick = threading.Thread(target=write, args=("second",))
         quick.start()
         quick.join(0.3)
-        assert len(events(database, got.job.id)) == before
+        assert len(list_events(database, got.job.id)) == before
     quick.join()
-    lines = [event.data["line"] for event in events(database, got.job.id)[before:]]
+    lines = [event.data["line"] for event in list_events(database, got.job.id)[before:]]
     assert lines == ["first", "second"]
 
 
 def test_a_reader_who_polls_while_two_writers_write_misses_no_event(database):
-    got, _ = claimed(database)
+    got, _ = submit_and_claim(database)
     stop, seen = threading.Event(), []
 
     def write(who):
@@ -397,7 +405,7 @@ def test_a_reader_who_polls_while_two_writers_write_misses_no_event(database):
         last, final = 0, False
         while not final:
             final = stop.is_set()
-            for event in events(database, got.job.id, last):
+            for event in list_events(database, got.job.id, last):
                 last = event.id
                 seen.append(event.id)
 
@@ -409,5 +417,5 @@ def test_a_reader_who_polls_while_two_writers_write_misses_no_event(database):
         thread.join()
     stop.set()
     reader.join()
-    assert seen == [event.id for event in events(database, got.job.id)]
+    assert seen == [event.id for event in list_events(database, got.job.id)]
     assert len(seen) == 32

@@ -19,8 +19,8 @@ from service.storage.tables import Dataset, Run
 from service.sweeps.groups import GroupKey, SweepGroups
 from service.sweeps.job_summary import load_groups
 from service.sweeps.summary import summarise_job
-from tests.dispatching import Place, carry_out
-from tests.inline_executor import InlineExecutor
+from tests.support.cluster.dispatch_place import Place, carry_out
+from tests.support.cluster.inline_executor import InlineExecutor
 
 pytestmark = pytest.mark.slow
 
@@ -60,11 +60,11 @@ def lose(place, claim):
         LeaseQueue(session).reap_expired(LeaseOwners(ended=frozenset({claim.lease.owner})))
 
 
-def source(place, claim):
+def make_source(place, claim):
     return JobRuns(place.database, claim, place.store)
 
 
-def cells(place, job):
+def list_cells(place, job):
     return [
         (run.number, run.cell, run.labels, run.seed, run.sigma, run.method)
         for run in place.runs(job)
@@ -89,7 +89,7 @@ def test_a_submission_makes_the_first_runs_and_the_dispatcher_the_others(place, 
     assert place.job(lazily).n_runs == len(place.runs(whole)) == N_RUNS
     carry_out(place, lazily, InlineExecutor())
     assert place.job(lazily).state is JobState.SUCCEEDED
-    assert cells(place, lazily) == cells(place, whole)
+    assert list_cells(place, lazily) == list_cells(place, whole)
 
 
 def carry_out_both(place, monkeypatch, **body):
@@ -128,24 +128,24 @@ def test_another_dispatcher_goes_on_making_runs_where_the_first_one_stopped(plac
     whole, job = submit_whole(place, monkeypatch, **SWEEP), place.submit(**SWEEP)
     assert claim(place).job.id == whole
     first = claim(place, "first")
-    coming = source(place, first).iterate_runs()
+    coming = make_source(place, first).iterate_runs()
     seen = [next(coming).run for _ in range(AT_ONCE + 1)]
     made = [run.id for run in place.runs(job)]
     assert len(made) == AT_ONCE + 1  # to the end of the chunk
     lose(place, first)
     second = claim(place, "second")
-    again = [one.run for one in source(place, second).iterate_runs()]
+    again = [one.run for one in make_source(place, second).iterate_runs()]
     # The first one learns that it has lost the lease.
     assert list(coming) == []
     assert again[: len(made)] == made
     assert seen == made[: len(seen)]
-    assert cells(place, job) == cells(place, whole)
+    assert list_cells(place, job) == list_cells(place, whole)
     assert len(set(again)) == N_RUNS
 
 
 def test_a_transaction_that_fails_makes_no_runs_and_the_next_one_makes_them(place, monkeypatch):
     job = place.submit(**SWEEP)
-    runs = source(place, claim(place))
+    runs = make_source(place, claim(place))
     create = RunWriter.create_runs
 
     def broken(ledger, made):
@@ -164,7 +164,7 @@ def test_a_transaction_that_fails_makes_no_runs_and_the_next_one_makes_them(plac
 def test_two_sources_of_one_lease_make_each_run_once(place):
     job = place.submit(**SWEEP)
     got = claim(place)
-    both = [source(place, got).iterate_runs() for _ in range(2)]
+    both = [make_source(place, got).iterate_runs() for _ in range(2)]
     for _ in range(N_RUNS):
         assert len({next(coming).run for coming in both}) == 1
     assert [run.number for run in place.runs(job)] == list(range(N_RUNS))
@@ -195,7 +195,7 @@ def test_a_cancelled_job_is_resumed_with_the_runs_that_were_never_made(place, mo
         submit.resume_job(session, job, place.settings)
     carry_out(place, job, InlineExecutor())
     assert place.job(job).state is JobState.SUCCEEDED
-    assert cells(place, job) == cells(place, whole)
+    assert list_cells(place, job) == list_cells(place, whole)
 
 
 def test_a_clone_has_the_same_cells(place):
@@ -203,8 +203,8 @@ def test_a_clone_has_the_same_cells(place):
     other = submit.clone_job(place.database, job, place.settings).id
     assert place.job(other).n_runs == N_RUNS
     for one in (job, other):
-        assert len(list(source(place, claim(place)).iterate_runs())) == N_RUNS, one
-    assert cells(place, other) == cells(place, job)
+        assert len(list(make_source(place, claim(place)).iterate_runs())) == N_RUNS, one
+    assert list_cells(place, other) == list_cells(place, job)
 
 
 @pytest.mark.parametrize(
@@ -264,5 +264,5 @@ def test_a_lease_that_has_expired_makes_nothing(place):
     with place.database.write_session() as session:
         got = LeaseQueue(session).claim_job("late", timedelta(seconds=0))
     lose(place, got)
-    assert list(source(place, got).iterate_runs()) == []
+    assert list(make_source(place, got).iterate_runs()) == []
     assert len(place.runs(job)) == AT_ONCE

@@ -13,8 +13,8 @@ from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.leases import HeldLeases
 from service.queue.dispatchers import DispatcherRepository
 from service.storage.tables import Parcel
-from tests.dispatching import Place
-from tests.stored import Clock, claim, job_of, state_of, submit
+from tests.support.cluster.dispatch_place import Place
+from tests.support.storage.job_rows import Clock, claim, job_of, state_of, submit
 from tests.unit.workers.test_scheduler import ScriptedExecutor, fails
 
 SECONDS = 30.0

@@ -16,8 +16,16 @@ from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.jobs import JobRepository
 from service.storage.sessions import Database
-from tests.limits import LIMIT_SECONDS
-from tests.stored import claim, claimed, job_of, parcels_of, runs_of, state_of, submit
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.storage.job_rows import (
+    claim,
+    job_of,
+    parcels_of,
+    runs_of,
+    state_of,
+    submit,
+    submit_and_claim,
+)
 
 pytestmark = pytest.mark.postgres  # SQLite has one writer at a time
 
@@ -109,7 +117,7 @@ def test_a_job_that_is_given_back_and_claimed_while_it_is_cancelled_is_cancelled
 
 
 def test_a_run_is_edited_while_its_dispatcher_writes_it(database):
-    got, (run,) = claimed(database)
+    got, (run,) = submit_and_claim(database)
 
     def edit() -> None:
         with database.write_session() as session:

@@ -13,7 +13,7 @@ import pytest
 from service.storage import objects
 from service.storage.errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
 from service.storage.objects import open_store
-from tests.stores import open_s3_client
+from tests.support.storage.object_stores import open_s3_client
 
 FUTURE = datetime.now(UTC) + timedelta(days=1)
 ABSENT = "0" * 64

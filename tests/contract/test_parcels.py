@@ -17,10 +17,18 @@ from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.errors import LeaseLost, RowConflict
 from service.storage.tables import Checkpoint
-from tests.dispatching import Place, carry_out
-from tests.inline_executor import InlineExecutor
-from tests.results import conclude, write_results
-from tests.stored import job_of, new_run, parcels_of, record_outcomes, runs_of, state_of, submit
+from tests.support.cluster.dispatch_place import Place, carry_out
+from tests.support.cluster.inline_executor import InlineExecutor
+from tests.support.storage.job_rows import (
+    job_of,
+    new_run,
+    parcels_of,
+    record_outcomes,
+    runs_of,
+    state_of,
+    submit,
+)
+from tests.support.storage.run_results import conclude, write_results
 
 N_RUNS, SIZE = 10, 4
 SMALL = {"population": 8, "generations": 3, "islands": 1, "refine": False}
@@ -34,7 +42,7 @@ def claim(database, owner, size=SIZE) -> Claim | None:
 
 
 @pytest.fixture
-def shared(database):
+def shared_job(database):
     """A job of which two dispatchers hold four runs each, and two runs wait."""
     submit(database, n_runs=N_RUNS)
     first, second = claim(database, "d1"), claim(database, "d2")
@@ -80,8 +88,8 @@ def test_claims_divide_a_job_and_each_has_a_token_of_its_own(database):
     assert list_states(database, job) == ["queued", "running"]
 
 
-def test_a_lost_parcel_is_given_back_alone_and_its_holder_writes_nothing_more(database, shared):
-    first, second = shared
+def test_a_lost_parcel_is_given_back_alone_and_its_holder_writes_nothing_more(database, shared_job):
+    first, second = shared_job
     assert reap(database, "d1").requeued == (first.job.id,)
     assert state_of(database, first.job.id) is JobState.RUNNING
     with pytest.raises(LeaseLost):
@@ -92,8 +100,8 @@ def test_a_lost_parcel_is_given_back_alone_and_its_holder_writes_nothing_more(da
     assert [run.number for run in pending(database, again)] == list(first.runs)
 
 
-def test_the_progress_of_a_job_is_the_sum_over_its_parcels(database, shared):
-    first, second = shared
+def test_the_progress_of_a_job_is_the_sum_over_its_parcels(database, shared_job):
+    first, second = shared_job
 
     def report(got, evaluations, generation):
         with database.write_session() as session:
@@ -110,8 +118,8 @@ def test_the_progress_of_a_job_is_the_sum_over_its_parcels(database, shared):
     assert job_of(database, second.job.id).n_done == len(second.runs)
 
 
-def test_the_last_parcel_ends_the_job_and_only_it(database, shared):
-    first, second = shared
+def test_the_last_parcel_ends_the_job_and_only_it(database, shared_job):
+    first, second = shared_job
     third = claim(database, "d1")
     with database.write_session() as session:
         RunWriter(session, third.lease).create_runs(new_run(number=n) for n in third.runs)
@@ -149,16 +157,16 @@ def test_of_parcels_that_end_at_once_exactly_one_is_the_last(database):
         assert sorted(was_ended) == [False, True]
 
 
-def test_a_parcel_ends_only_with_all_its_runs(database, shared):
-    first, _ = shared
+def test_a_parcel_ends_only_with_all_its_runs(database, shared_job):
+    first, _ = shared_job
     run = pending(database, first)[0]
     record_outcomes(database, first.lease, RunOutcome(run_id=run.id, state=JobState.SUCCEEDED))
     with pytest.raises(RowConflict, match="3 of its runs did not finish"):
         end_parcel(database, first)
 
 
-def test_a_cancel_reaches_all_holders_and_the_last_one_ends_the_job(database, shared):
-    first, second = shared
+def test_a_cancel_reaches_all_holders_and_the_last_one_ends_the_job(database, shared_job):
+    first, second = shared_job
     job = first.job.id
     with database.write_session() as session:
         JobRepository(session).cancel(job)
@@ -174,8 +182,8 @@ def test_a_cancel_reaches_all_holders_and_the_last_one_ends_the_job(database, sh
     assert parcels_of(database, job) == []
 
 
-def test_a_cancelled_job_ends_with_its_last_holder_also_if_that_one_dies(database, shared):
-    first, second = shared
+def test_a_cancelled_job_ends_with_its_last_holder_also_if_that_one_dies(database, shared_job):
+    first, second = shared_job
     with database.write_session() as session:
         JobRepository(session).cancel(first.job.id)
     with database.write_session() as session:
@@ -185,8 +193,10 @@ def test_a_cancelled_job_ends_with_its_last_holder_also_if_that_one_dies(databas
     assert state_of(database, first.job.id) is JobState.CANCELLED
 
 
-def test_a_cancelled_job_ends_although_the_runs_of_its_last_holder_ended_first(database, shared):
-    first, second = shared
+def test_a_cancelled_job_ends_although_the_runs_of_its_last_holder_ended_first(
+    database, shared_job
+):
+    first, second = shared_job
     with database.write_session() as session:
         JobRepository(session).cancel(first.job.id)
     with database.write_session() as session:
@@ -197,8 +207,8 @@ def test_a_cancelled_job_ends_although_the_runs_of_its_last_holder_ended_first(d
     assert parcels_of(database, first.job.id) == []
 
 
-def test_checkpoints_of_cancelled_runs_outlive_what_other_holders_write(database, shared):
-    first, second = shared
+def test_checkpoints_of_cancelled_runs_outlive_what_other_holders_write(database, shared_job):
+    first, second = shared_job
     runs = [run.id for run in pending(database, second)]
     with database.write_session() as session:
         RunWriter(session, second.lease).save_checkpoints([(run, 7, b"state") for run in runs])
@@ -210,8 +220,8 @@ def test_checkpoints_of_cancelled_runs_outlive_what_other_holders_write(database
         assert set(session.scalars(select(Checkpoint.run_id))) == set(runs)
 
 
-def test_a_split_leaves_losses_and_evaluations_with_their_runs(database, shared):
-    first, second = shared
+def test_a_split_leaves_losses_and_evaluations_with_their_runs(database, shared_job):
+    first, second = shared_job
     for got, evaluations in ((first, 400), (second, 1000)):
         for run in pending(database, got):
             outcome = RunOutcome(
@@ -277,8 +287,8 @@ def test_losses_are_counted_for_each_parcel_and_the_first_that_has_too_many_fail
         pending(database, healthy)
 
 
-def test_a_resumed_job_is_one_parcel_of_what_is_left(database, shared):
-    first, second = shared
+def test_a_resumed_job_is_one_parcel_of_what_is_left(database, shared_job):
+    first, second = shared_job
     end_runs(database, second)
     with database.write_session() as session:
         LeaseQueue(session).finish_job(first.lease, JobState.FAILED, "as told")
@@ -289,8 +299,8 @@ def test_a_resumed_job_is_one_parcel_of_what_is_left(database, shared):
     assert [run.number for run in pending(database, again)] == list(first.runs)
 
 
-def test_a_released_parcel_waits_and_the_job_too_if_nobody_else_holds_one(database, shared):
-    first, second = shared
+def test_a_released_parcel_waits_and_the_job_too_if_nobody_else_holds_one(database, shared_job):
+    first, second = shared_job
     for got, state in ((first, JobState.RUNNING), (second, JobState.QUEUED)):
         with database.write_session() as session:
             LeaseQueue(session).release_job(got.lease)
@@ -299,8 +309,8 @@ def test_a_released_parcel_waits_and_the_job_too_if_nobody_else_holds_one(databa
     assert [one.stop for one in parcels_of(database, first.job.id)] == [1, 4, 8, 10]
 
 
-def test_a_holder_sees_that_its_job_has_more_and_others_see_the_job(database, shared):
-    first, _ = shared
+def test_a_holder_sees_that_its_job_has_more_and_others_see_the_job(database, shared_job):
+    first, _ = shared_job
     job = first.job.id
     with database.read_session() as session:
         own, others = (read_queue_status(session, "d1", held=held) for held in ([job], []))
@@ -337,7 +347,7 @@ def turn(place, job: str, *dispatchers: Dispatcher) -> None:
     raise AssertionError(f"{job} did not end")
 
 
-def results(place, job: str):
+def list_results(place, job: str):
     return [(run.number, run.state, run.estimates, run.spec_hash) for run in place.runs(job)]
 
 
@@ -348,7 +358,7 @@ def test_two_dispatchers_share_one_sweep_with_the_results_of_one(place):
     job = place.submit(**SWEEP)
     both = [begin(place), begin(place)]
     turn(place, job, *both)
-    assert results(place, job) == results(place, alone)
+    assert list_results(place, job) == list_results(place, alone)
     tokens = [run.attempt for run in place.runs(job)]
     assert tokens[0] != tokens[2] != tokens[4]  # the parcels of two runs each
     assert list_states(place.database, job) == ["queued", "running", "succeeded"]

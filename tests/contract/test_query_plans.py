@@ -67,9 +67,9 @@ from service.storage.tables import (
     StoredSummary,
 )
 from service.upkeep.retention import list_deleted_jobs, list_ended_jobs
-from tests.database import record_statements
-from tests.results import conclude, encode_results, write_result
-from tests.stored import claimed, new_dataset, new_job, new_run
+from tests.support.storage.databases import record_statements
+from tests.support.storage.job_rows import new_dataset, new_job, new_run, submit_and_claim
+from tests.support.storage.run_results import conclude, encode_results, write_result
 
 N_JOBS, N_RUNS, N_EVENTS, N_OTHERS = 3000, 2000, 3000, 2000
 GROWING = {"jobs", "runs", "events", "datasets", "checkpoints", "run_history", "migrations_log"}
@@ -112,13 +112,13 @@ ON_POSTGRES = pytest.param(("postgres", "fresh"), marks=pytest.mark.postgres)
 
 
 @pytest.fixture(params=[*STATISTICS, ON_POSTGRES], ids="-".join)
-def filled(request: pytest.FixtureRequest) -> Filled:
+def database_with_jobs(request: pytest.FixtureRequest) -> Filled:
     """A database with many ended jobs, one of them large, and a claimed job with two runs."""
     kind, statistics = request.param
     database: Database = request.getfixturevalue(f"{kind}_database")
     if statistics == "old":
         database.update_statistics()
-    ended, runs_of_ended = claimed(database, n_runs=2)
+    ended, runs_of_ended = submit_and_claim(database, n_runs=2)
     with database.write_session() as session:
         LeaseQueue(session).finish_job(ended.lease, JobState.CANCELLED)
     copy_row(
@@ -129,7 +129,7 @@ def filled(request: pytest.FixtureRequest) -> Filled:
         state="CASE WHEN s.n % 100 = 0 THEN 'failed' ELSE 'succeeded' END",
         spec=f"""'{{"model": "{"m" * 1000}"}}'""",
     )
-    open_one, ids = claimed(database, n_runs=2)
+    open_one, ids = submit_and_claim(database, n_runs=2)
     owners = [f"job_0000000000{number}" for number in range(5)]
     for number, job in enumerate([*owners, open_one.job.id]):
         copy_row(
@@ -196,7 +196,7 @@ def filled(request: pytest.FixtureRequest) -> Filled:
     return database, open_one, ids
 
 
-def plan(database: Database, statement: str, given: Any) -> list[str]:
+def read_plan(database: Database, statement: str, given: Any) -> list[str]:
     """The steps of a statement's plan that read a table, as texts of SQLite's form."""
     with database.engine.connect() as connection:
         if database.is_sqlite:
@@ -220,7 +220,7 @@ def describe_node(node: dict[str, Any]) -> Iterator[str]:
 
 def find_faults(database: Database, statement: str, given: Any) -> list[str]:
     """The steps of a plan that read a whole table, or all rows of a project to choose from."""
-    steps = plan(database, statement, given)
+    steps = read_plan(database, statement, given)
     is_ordered = "LIMIT" in statement and not any("TEMP B-TREE" in step for step in steps)
     faults = []
     for step in steps:
@@ -515,19 +515,21 @@ USE_CASES: dict[Callable[[Filled], None], tuple[str, ...]] = {
 """What is done often or under the write lock, and the indexes that it must use."""
 
 
-def test_no_hot_query_reads_a_whole_table(filled: Filled) -> None:
+def test_no_hot_query_reads_a_whole_table(database_with_jobs: Filled) -> None:
     faults, used = [], {}
     for use_case in USE_CASES:  # in this order
-        with record_statements(filled[0]) as statements:
-            use_case(filled)
+        with record_statements(database_with_jobs[0]) as statements:
+            use_case(database_with_jobs)
         assert statements
         used[use_case] = " ".join(
-            step for statement, given in statements for step in plan(filled[0], statement, given)
+            step
+            for statement, given in statements
+            for step in read_plan(database_with_jobs[0], statement, given)
         )
         faults += [
             (use_case.__name__, fault, statement)
             for statement, given in statements
-            for fault in find_faults(filled[0], statement, given)
+            for fault in find_faults(database_with_jobs[0], statement, given)
         ]
     assert not faults, "\n".join(map(str, faults))
     for use_case, indexes in USE_CASES.items():

@@ -13,11 +13,10 @@ from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.errors import LeaseLost, RowConflict
-from tests.limits import LIMIT_SECONDS
-from tests.stored import (
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.storage.job_rows import (
     Clock,
     claim,
-    claimed,
     job_of,
     new_run,
     parcel_of,
@@ -25,6 +24,7 @@ from tests.stored import (
     runs_of,
     state_of,
     submit,
+    submit_and_claim,
 )
 
 LEASE = timedelta(seconds=10)
@@ -271,7 +271,7 @@ def test_an_expired_job_is_queued_again_with_its_unfinished_runs(database, clock
 
 
 def test_a_reaped_job_takes_no_run_of_another_job_with_it(database, clock):
-    lost, rival = claimed(database), claimed(database)
+    lost, rival = submit_and_claim(database), submit_and_claim(database)
     for got, runs in (lost, rival):
         with database.write_session() as session:
             RunWriter(session, got.lease).start_runs(runs)
@@ -324,7 +324,7 @@ def test_two_reapers_bury_a_job_once(database, clock):
 
 
 def test_a_released_job_is_queued_and_nothing_is_counted_against_it(database):
-    got, _ = claimed(database)
+    got, _ = submit_and_claim(database)
     with database.write_session() as session:
         LeaseQueue(session).release_job(got.lease)
     job = job_of(database, got.job.id)
@@ -334,7 +334,7 @@ def test_a_released_job_is_queued_and_nothing_is_counted_against_it(database):
 
 
 def test_a_job_released_after_a_wish_to_cancel_is_cancelled(database):
-    got, _ = claimed(database)
+    got, _ = submit_and_claim(database)
     with database.write_session() as session:
         JobRepository(session).cancel(got.job.id)
         LeaseQueue(session).release_job(got.lease)
@@ -367,7 +367,7 @@ LATE_WRITES = {
 
 @pytest.mark.parametrize("write", LATE_WRITES.values(), ids=LATE_WRITES)
 def test_a_late_writer_is_refused_and_changes_nothing(database, clock, write):
-    got, (run_id,) = claimed(database)
+    got, (run_id,) = submit_and_claim(database)
     with database.write_session() as session:
         LeaseQueue(session, clock).renew_leases(
             [got.lease]
@@ -390,7 +390,7 @@ def test_a_late_writer_is_refused_and_changes_nothing(database, clock, write):
 
 @pytest.mark.parametrize("end", ENDS)
 def test_a_terminal_state_is_never_overwritten(database, clock, end):
-    got, (run_id,) = claimed(database)
+    got, (run_id,) = submit_and_claim(database)
     with database.write_session() as session:
         RunWriter(session, got.lease).record_outcomes([RunOutcome(run_id=run_id, state=end)])
         LeaseQueue(session).finish_job(got.lease, end, "as told")
@@ -406,16 +406,16 @@ def test_a_terminal_state_is_never_overwritten(database, clock, end):
 
 
 def test_a_job_cannot_succeed_while_a_run_is_unfinished(database):
-    got, _ = claimed(database, n_runs=2)
+    got, _ = submit_and_claim(database, n_runs=2)
     with pytest.raises(RowConflict, match="2 of its runs"):
         finish(database, got.lease)
     assert state_of(database, got.job.id) is JobState.RUNNING
 
 
 def test_results_of_another_job_neither_end_this_one_nor_are_its_best(database):
-    other, (done,) = claimed(database)
+    other, (done,) = submit_and_claim(database)
     record_success(database, other.lease, done, 0.1)
-    got, (run_id,) = claimed(database)
+    got, (run_id,) = submit_and_claim(database)
     with pytest.raises(RowConflict, match="1 of its runs"):
         finish(database, got.lease)
     record_success(database, got.lease, run_id, 0.7)
@@ -427,13 +427,13 @@ def test_results_of_another_job_neither_end_this_one_nor_are_its_best(database):
 
 @pytest.mark.parametrize("end", [JobState.FAILED, JobState.CANCELLED])
 def test_unfinished_runs_end_with_their_job(database, end):
-    got, _ = claimed(database, n_runs=3)
+    got, _ = submit_and_claim(database, n_runs=3)
     finish(database, got.lease, end, "no memory")
     assert {(run.state, run.error) for run in runs_of(database, got.job.id)} == {(end, "no memory")}
 
 
 def test_progress_is_kept_and_told_and_the_best_never_rises(database):
-    got, _ = claimed(database)
+    got, _ = submit_and_claim(database)
     for rms in (0.5, None, 0.2, 0.9):
         with database.write_session() as session:
             LeaseQueue(session).write_progress(got.lease, JobProgress(100, 7, rms, 3.5))
@@ -446,7 +446,7 @@ def test_progress_is_kept_and_told_and_the_best_never_rises(database):
 
 
 def test_the_best_of_an_ended_job_is_that_of_its_results(database):
-    got, runs = claimed(database)
+    got, runs = submit_and_claim(database)
     with database.write_session() as session:
         LeaseQueue(session).write_progress(
             got.lease, JobProgress(100, 7, 0.2, 3.5)

@@ -22,17 +22,17 @@ from service.queue.run_writes import RunOutcome, RunWriter
 from service.storage import columns
 from service.storage.columns import utc_now
 from sysid.core.machine import read_machine_id
-from tests.dispatching import until
-from tests.stored import (
+from tests.support.cluster.dispatch_place import until
+from tests.support.storage.job_rows import (
     Clock,
     claim,
-    claimed,
     job_of,
     new_run,
     parcel_of,
     runs_of,
     state_of,
     submit,
+    submit_and_claim,
 )
 
 LEASE = timedelta(seconds=10)
@@ -159,7 +159,7 @@ def test_a_job_is_not_spared_for_the_progress_of_another_dispatcher(database, cl
 
 
 def test_a_job_given_back_because_the_workers_are_gone_counts_as_lost(database) -> None:
-    got, _ = claimed(database, max_attempts=2)
+    got, _ = submit_and_claim(database, max_attempts=2)
     with database.write_session() as session:
         LeaseQueue(session).release_job(got.lease, lost=True)
     assert job_of(database, got.job.id).lost_leases == 1
@@ -172,7 +172,7 @@ def test_a_job_given_back_because_the_workers_are_gone_counts_as_lost(database) 
 
 
 def test_deaths_over_a_run_outlive_the_dispatcher_that_counted_them(database) -> None:
-    got, (run,) = claimed(database)
+    got, (run,) = submit_and_claim(database)
     with database.write_session() as session:
         RunWriter(session, got.lease).write_kills({run: 1})
     with database.write_session() as session:
@@ -195,7 +195,7 @@ def test_the_web_process_reaps_too(database) -> None:
         reaper.join()
 
 
-def expired(database, owner: str, details, seconds: float = 0.1) -> str:
+def let_lease_expire(database, owner: str, details, seconds: float = 0.1) -> str:
     """A job whose owner has told these details, and whose lease has ended since then."""
     job = submit(database)
     announce(database, owner, details)
@@ -209,8 +209,8 @@ def expired(database, owner: str, details, seconds: float = 0.1) -> str:
 def test_a_dispatcher_that_lives_here_is_not_reaped_while_it_waits_for_the_database(
     database,
 ) -> None:
-    job = expired(database, "here", describe_process(), HUNG_AFTER.total_seconds() - 10)
-    lost = expired(database, "elsewhere", {**describe_process(), "machine": "another"})
+    job = let_lease_expire(database, "here", describe_process(), HUNG_AFTER.total_seconds() - 10)
+    lost = let_lease_expire(database, "elsewhere", {**describe_process(), "machine": "another"})
     assert reap_jobs(database).requeued == (lost,)
     assert state_of(database, job) is JobState.RUNNING
     assert job_of(database, job).lost_leases == 0
@@ -220,7 +220,7 @@ def test_a_dispatcher_that_lives_here_is_not_reaped_while_it_waits_for_the_datab
 def test_a_dispatcher_that_lives_but_hangs_is_reaped_at_last_and_not_called_gone(
     database, caplog: pytest.LogCaptureFixture
 ) -> None:
-    job = expired(database, "here", describe_process(), HUNG_AFTER.total_seconds() + 1)
+    job = let_lease_expire(database, "here", describe_process(), HUNG_AFTER.total_seconds() + 1)
     with caplog.at_level(logging.WARNING):
         assert reap_jobs(database).requeued == (job,)
     (told,) = caplog.messages
@@ -245,7 +245,7 @@ def test_a_dispatcher_that_is_stopped_is_reaped_when_its_lease_ends(database) ->
         os.waitid(os.P_PID, process.pid, os.WSTOPPED)
         assert not is_awake(details)
         assert not is_gone(details)
-        job = expired(database, "stopped", details)
+        job = let_lease_expire(database, "stopped", details)
         assert reap_jobs(database).requeued == (job,)
     finally:
         process.kill()

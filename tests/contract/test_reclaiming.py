@@ -13,8 +13,8 @@ from service.repositories.history import HistoryPoint, MigrantPoint
 from service.repositories.runs import RunRepository
 from service.storage.tables import Checkpoint
 from sysid.identification.run import begin_run
-from tests.runs import RECORDS, encode_runs, spec
-from tests.searching import bits
+from tests.support.cluster.small_runs import RECORDS, encode_runs, spec
+from tests.support.library.search_problems import bits
 from workers.protocol import QueuedRun, RunFailure
 from workers.tasks import build_pack_problems
 
@@ -41,11 +41,11 @@ def recorder(place, claim):
     return RunRecorder(place.database, claim, place.store, encode_runs, lambda *_: None)
 
 
-def point(run, number):
+def make_point(run, number):
     return HistoryPoint(run, 0, number, 10 * number, 50, 1.0 / (number + 1), "genetic", [1.5])
 
 
-def saved_by_another(place, state) -> None:
+def save_by_another(place, state) -> None:
     """A job of another dispatcher with a failure and a checkpoint."""
     rival = place.submit(sweep={"axes": [{"path": "/seed", "values": [1, 2]}]})
     with place.database.write_session() as session:
@@ -69,7 +69,7 @@ def saved_by_another(place, state) -> None:
 
 
 def test_progress_and_reasons_go_on_from_the_attempt_before(place, state) -> None:
-    saved_by_another(place, state)
+    save_by_another(place, state)
     job = place.submit(sweep=SWEEP)
     first, runs = claim(place), [run.id for run in place.runs(job)]
     with place.database.write_session() as session:
@@ -107,7 +107,7 @@ def test_a_run_whose_checkpoint_is_refused_loses_its_history_and_only_that_run(
     with place.database.write_session() as session:
         ledger = RunWriter(session, first.lease)
         ledger.append_history(
-            [point(run, number) for run in runs for number in range(2)],
+            [make_point(run, number) for run in runs for number in range(2)],
             [MigrantPoint(run, 0, 1, 0, 1, 0.5) for run in runs],
         )
         ledger.record_outcomes([RunOutcome(run_id=runs[0], state=JobState.SUCCEEDED)])

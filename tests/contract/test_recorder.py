@@ -37,11 +37,11 @@ from sysid.islands.state import RunState
 from sysid.search.archive import make_archive
 from sysid.search.island import Island
 from sysid.search.state import SEARCH_RECORD, Improvement, Migrant
-from tests.dispatching import Place
-from tests.limits import LIMIT_SECONDS
-from tests.results import conclude, encode_results
-from tests.runs import encode_runs, spec
-from tests.searching import bits
+from tests.support.cluster.dispatch_place import Place
+from tests.support.cluster.small_runs import encode_runs, spec
+from tests.support.library.search_problems import bits
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.storage.run_results import conclude, encode_results
 from workers.protocol import CompleteRun, RunConclusion, RunFailure
 
 N_RUNS, GENERATIONS = 4, 100
@@ -91,7 +91,7 @@ class Desk:
 
     def tell_result(self, run: str, state: RunState) -> None:
         """Tell the recorder of a run that ended in this state, by itself in a pack."""
-        results, told = {run: concluded(state)}, {run: self.states_told.get(run)}
+        results, told = {run: conclude_run(state)}, {run: self.states_told.get(run)}
         reported = {name: one for name, one in told.items() if one is not None}
         self.recorder.record_results(encode_results(results, self.place.database, reported))
 
@@ -125,7 +125,7 @@ def desk(tmp_path: Path, database: Database) -> Desk:
     return Desk(Place(tmp_path / "data", database))
 
 
-def searched(
+def make_run_state(
     generation: int, evaluations: int, *rms: float, migrants: tuple[Migrant, ...] = ()
 ) -> RunState:
     """A run that found these RMS one after the other, with one island."""
@@ -140,7 +140,7 @@ def searched(
     return RunState(1, (island,), generation, migrations=migrants)
 
 
-def concluded(state: RunState) -> RunConclusion:
+def conclude_run(state: RunState) -> RunConclusion:
     """The result of a run that ended in this state."""
     return conclude(
         state.rms,
@@ -153,11 +153,11 @@ def concluded(state: RunState) -> RunConclusion:
 
 def test_progress_is_written_every_second_and_checkpoints_every_four(desk: Desk) -> None:
     run = desk.runs[0]
-    desk.tell_progress(run, searched(10, 100, 0.5), 1.0)
+    desk.tell_progress(run, make_run_state(10, 100, 0.5), 1.0)
     desk.recorder.write_due()
     assert desk.checkpoints() == {run: 100}
     assert desk.place.job(desk.job).evaluations == 100
-    desk.tell_progress(run, searched(20, 200, 0.5), 2.0)
+    desk.tell_progress(run, make_run_state(20, 200, 0.5), 2.0)
     desk.write_after(PROGRESS_SECONDS - 0.1)
     assert desk.place.job(desk.job).evaluations == 100
     desk.write_after(0.2)
@@ -169,21 +169,21 @@ def test_progress_is_written_every_second_and_checkpoints_every_four(desk: Desk)
     assert desk.checkpoints() == {run: 200}
     with desk.place.database.read_session() as session:
         stored = unpack_state(session.query(Checkpoint).one().state)
-    assert bits(stored) == bits(searched(20, 200, 0.5))
+    assert bits(stored) == bits(make_run_state(20, 200, 0.5))
 
 
 def test_a_run_that_did_not_go_on_is_not_saved_again(desk: Desk) -> None:
-    def saved_at() -> list[object]:
+    def read_save_times() -> list[object]:
         with desk.place.database.read_session() as session:
             return [session.get_one(Checkpoint, run).created_at for run in desk.runs[:2]]
 
     for run in desk.runs[:2]:
-        desk.tell_progress(run, searched(10, 100, 0.5), 1.0)
+        desk.tell_progress(run, make_run_state(10, 100, 0.5), 1.0)
     desk.recorder.write_due()
-    before = saved_at()
-    desk.tell_progress(desk.runs[0], searched(20, 200, 0.5), 2.0)
+    before = read_save_times()
+    desk.tell_progress(desk.runs[0], make_run_state(20, 200, 0.5), 2.0)
     desk.write_after(CHECKPOINT_SECONDS + 0.1)
-    assert [old == new for old, new in zip(before, saved_at(), strict=True)] == [False, True]
+    assert [old == new for old, new in zip(before, read_save_times(), strict=True)] == [False, True]
 
 
 def test_starts_are_collected_for_a_second_and_deaths_are_written_at_once(desk: Desk) -> None:
@@ -200,7 +200,7 @@ def test_starts_are_collected_for_a_second_and_deaths_are_written_at_once(desk: 
     assert [run.kills for run in desk.place.runs(desk.job)] == [0, 1, 0, 0]
 
 
-class Held:
+class HeldDesk:
     """A thread whose work waits until it is let go."""
 
     def __init__(self) -> None:
@@ -215,7 +215,7 @@ class Held:
 
 
 def test_a_death_is_written_at_once_also_while_a_batch_is_being_written(desk: Desk) -> None:
-    desk.run_beside = held = Held()
+    desk.run_beside = held = HeldDesk()
     desk.recorder = desk.claim_again()
     desk.recorder.record_start(desk.runs[0])
     desk.recorder.write_due()
@@ -230,10 +230,10 @@ def test_the_end_of_a_parcel_is_written_beside_what_goes_on(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder, "FEW_ENDED", 0)
-    desk.run_beside = held = Held()
+    desk.run_beside = held = HeldDesk()
     desk.recorder = desk.claim_again()
     for run in desk.runs:
-        desk.tell_result(run, searched(5, 50, 0.5))
+        desk.tell_result(run, make_run_state(5, 50, 0.5))
     desk.recorder.end_parcel()
     desk.recorder.write_due()
     assert desk.recorder.has_ended is None
@@ -261,7 +261,7 @@ def test_a_recorder_writes_nothing_after_its_parcel(
 
 
 def test_nothing_is_written_while_nothing_happens(desk: Desk) -> None:
-    desk.tell_progress(desk.runs[0], searched(10, 100, 0.5), 1.0)
+    desk.tell_progress(desk.runs[0], make_run_state(10, 100, 0.5), 1.0)
     desk.recorder.write_due()
     with desk.place.database.read_session() as session:
         before = EventRepository(session).list_after(desk.job)[-1].id
@@ -273,9 +273,9 @@ def test_nothing_is_written_while_nothing_happens(desk: Desk) -> None:
 def test_each_evaluation_counts_once_whatever_becomes_of_its_run(desk: Desk) -> None:
     done, fails, goes_on, refused = desk.runs
     for run in (done, fails, goes_on):
-        desk.tell_progress(run, searched(10, 100, 0.5), 1.0)
+        desk.tell_progress(run, make_run_state(10, 100, 0.5), 1.0)
     desk.recorder.write_due()
-    desk.tell_result(done, searched(30, 310, 0.5, 0.2))
+    desk.tell_result(done, make_run_state(30, 310, 0.5, 0.2))
     desk.recorder.record_failure(fails, RunFailure("as told"))
     desk.recorder.record_failure(refused, RunFailure("late", evaluations=40))
     desk.recorder.write_all()
@@ -299,15 +299,15 @@ def read_counters() -> dict[str, float]:
 
 def test_the_metrics_count_each_run_and_each_evaluation_of_this_attempt_once(desk: Desk) -> None:
     first, second, third, fourth = desk.runs
-    desk.tell_progress(first, searched(10, 100, 0.5), 1.0)
+    desk.tell_progress(first, make_run_state(10, 100, 0.5), 1.0)
     desk.recorder.write_all()
     before = read_counters()
     desk.recorder = desk.claim_again()  # of the first run, 100 evaluations belong to the past
-    desk.tell_progress(first, searched(20, 170, 0.5), 1.0)
-    desk.tell_progress(first, searched(30, 250, 0.4), 1.0)
-    desk.tell_result(first, searched(40, 300, 0.3))
-    desk.tell_result(second, searched(40, 1000, 0.3))
-    desk.tell_progress(third, searched(5, 7, 0.5), 1.0)
+    desk.tell_progress(first, make_run_state(20, 170, 0.5), 1.0)
+    desk.tell_progress(first, make_run_state(30, 250, 0.4), 1.0)
+    desk.tell_result(first, make_run_state(40, 300, 0.3))
+    desk.tell_result(second, make_run_state(40, 1000, 0.3))
+    desk.tell_progress(third, make_run_state(5, 7, 0.5), 1.0)
     desk.recorder.record_failure(third, RunFailure("no way", evaluations=9))
     desk.recorder.record_reuse(fourth, second)
     counted = {name: value - before[name] for name, value in read_counters().items()}
@@ -317,7 +317,7 @@ def test_the_metrics_count_each_run_and_each_evaluation_of_this_attempt_once(des
 def test_a_run_that_begins_and_ends_between_two_writes_has_both_times(desk: Desk) -> None:
     run = desk.runs[0]
     desk.recorder.record_start(run)
-    desk.tell_result(run, searched(5, 50, 0.5))
+    desk.tell_result(run, make_run_state(5, 50, 0.5))
     desk.recorder.write_due()
     row = desk.place.runs(desk.job)[0]
     assert row.state is JobState.SUCCEEDED
@@ -329,11 +329,11 @@ def test_history_is_whole_whatever_was_written_before_the_end(desk: Desk) -> Non
     first, second = desk.runs[:2]
     migrants = tuple(Migrant(epoch, 0, 1, 0.5) for epoch in range(3))
     for run in (first, second):
-        desk.tell_progress(run, searched(10, 100, 0.9, 0.8, migrants=migrants[:1]), 1.0)
+        desk.tell_progress(run, make_run_state(10, 100, 0.9, 0.8, migrants=migrants[:1]), 1.0)
     desk.recorder.write_due()
-    desk.tell_progress(first, searched(20, 200, 0.9, 0.8, 0.7, migrants=migrants[:2]), 2.0)
+    desk.tell_progress(first, make_run_state(20, 200, 0.9, 0.8, 0.7, migrants=migrants[:2]), 2.0)
     desk.write_after(PROGRESS_SECONDS + 0.1)
-    end = searched(30, 300, 0.9, 0.8, 0.7, 0.6, migrants=migrants)
+    end = make_run_state(30, 300, 0.9, 0.8, 0.7, 0.6, migrants=migrants)
     for run in (first, second):
         desk.tell_result(run, end)
     desk.write_after(PROGRESS_SECONDS + 0.1)
@@ -354,8 +354,8 @@ def test_points_that_were_told_but_not_written_before_the_end_are_not_lost(desk:
     run = desk.runs[0]
     migrants = tuple(Migrant(epoch, 0, 1, 0.5) for epoch in range(2))
     desk.recorder.write_all()
-    desk.tell_progress(run, searched(10, 100, 0.9, 0.8, migrants=migrants[:1]), 1.0)
-    desk.tell_result(run, searched(30, 300, 0.9, 0.8, 0.7, migrants=migrants))
+    desk.tell_progress(run, make_run_state(10, 100, 0.9, 0.8, migrants=migrants[:1]), 1.0)
+    desk.tell_result(run, make_run_state(30, 300, 0.9, 0.8, 0.7, migrants=migrants))
     desk.recorder.write_all()
     with desk.place.database.read_session() as session:
         history = RunRepository(session).read_history(run)
@@ -369,7 +369,7 @@ def end_all(desk: Desk, n_failed: int) -> None:
         if number < n_failed:
             desk.recorder.record_failure(run, RunFailure(f"reason {number}"))
         else:
-            desk.tell_result(run, searched(5, 50, 0.5))
+            desk.tell_result(run, make_run_state(5, 50, 0.5))
     desk.recorder.finish_job()
 
 
@@ -392,13 +392,13 @@ def test_a_job_fails_when_all_its_runs_failed_and_tells_some_reasons(
 
 def test_a_job_that_stops_or_is_cancelled_goes_on_from_its_last_states(desk: Desk) -> None:
     run = desk.runs[0]
-    desk.tell_progress(run, searched(10, 100, 0.5), 1.0)
+    desk.tell_progress(run, make_run_state(10, 100, 0.5), 1.0)
     desk.recorder.write_due()
-    desk.tell_progress(run, searched(20, 200, 0.5), 1.5)
+    desk.tell_progress(run, make_run_state(20, 200, 0.5), 1.5)
     desk.recorder.write_all()
     assert desk.checkpoints() == {run: 200}
     desk.recorder = desk.claim_again()
-    desk.tell_progress(run, searched(30, 300, 0.5), 2.0)
+    desk.tell_progress(run, make_run_state(30, 300, 0.5), 2.0)
     desk.recorder.cancel_parcel()
     assert desk.place.job(desk.job).state is JobState.CANCELLED
     assert desk.place.job(desk.job).evaluations == 300  # those of its checkpoint are among them
@@ -413,20 +413,20 @@ def test_a_job_that_stops_or_is_cancelled_goes_on_from_its_last_states(desk: Des
 def test_a_checkpoint_counts_until_its_run_goes_on_or_ends(desk: Desk) -> None:
     fails, ends, waits, _ = desk.runs
     for run in (fails, ends, waits):
-        desk.tell_progress(run, searched(10, 100, 0.5), 1.0)
+        desk.tell_progress(run, make_run_state(10, 100, 0.5), 1.0)
     desk.recorder.write_all()
     desk.recorder = desk.claim_again()
     desk.recorder.write_all()
     assert desk.place.job(desk.job).evaluations == 300
     desk.recorder.record_failure(fails, RunFailure("as told"))
-    desk.tell_result(ends, searched(30, 310, 0.5))
+    desk.tell_result(ends, make_run_state(30, 310, 0.5))
     desk.recorder.write_all()
     assert desk.place.job(desk.job).evaluations == 100 + 310 + 100
     assert [run.evaluations for run in desk.place.runs(desk.job)[:2]] == [100, 310]
     assert desk.checkpoints() == {waits: 100}
 
 
-def computed_before(desk: Desk, evaluations: int) -> str:
+def add_computed_run(desk: Desk, evaluations: int) -> str:
     """A run of another job that has succeeded with so many evaluations."""
     job = desk.place.submit()
     with desk.place.database.write_session() as session:
@@ -452,11 +452,11 @@ def computed_before(desk: Desk, evaluations: int) -> str:
 
 
 def test_a_result_that_is_taken_over_counts_once(desk: Desk) -> None:
-    source = computed_before(desk, 1000)
+    source = add_computed_run(desk, 1000)
     desk.recorder.record_reuse(desk.runs[0], source)
     desk.recorder.write_due()
     for number, run in enumerate(desk.runs[1:]):
-        desk.tell_result(run, searched(5, 50, 0.5))
+        desk.tell_result(run, make_run_state(5, 50, 0.5))
         desk.write_after(PROGRESS_SECONDS + 0.1)
         assert desk.place.job(desk.job).evaluations == 1000 + 50 * (number + 1)
     desk.recorder.finish_job()
@@ -468,12 +468,12 @@ def test_a_result_that_is_taken_over_counts_once(desk: Desk) -> None:
 
 def test_what_is_left_is_told_from_what_was_computed_in_this_attempt(desk: Desk) -> None:
     first, second, third, _ = desk.runs
-    source = computed_before(desk, 1000)
-    desk.tell_progress(first, searched(50, 100, 0.5), 1.0)
+    source = add_computed_run(desk, 1000)
+    desk.tell_progress(first, make_run_state(50, 100, 0.5), 1.0)
     desk.recorder.write_all()
     desk.recorder = desk.claim_again()
-    desk.tell_progress(first, searched(60, 120, 0.5), 1.0)
-    desk.tell_progress(second, searched(10, 20, 0.5), 1.0)
+    desk.tell_progress(first, make_run_state(60, 120, 0.5), 1.0)
+    desk.tell_progress(second, make_run_state(10, 20, 0.5), 1.0)
     desk.stopwatch.now += 10.0
     desk.recorder.write_all()
     # 10 generations in 10 s: those of the second run, as the first one went on at 60.
@@ -481,14 +481,16 @@ def test_what_is_left_is_told_from_what_was_computed_in_this_attempt(desk: Desk)
     desk.recorder.record_reuse(third, source)
     desk.recorder.write_all()
     assert desk.place.job(desk.job).seconds_left == pytest.approx(300 - 60 - 10)
-    desk.tell_result(second, searched(100, 200, 0.5))
+    desk.tell_result(second, make_run_state(100, 200, 0.5))
     desk.recorder.write_all()
     assert desk.place.job(desk.job).seconds_left == pytest.approx(10 * (200 - 60) / 100)
 
 
 def pack_signals(desk: Desk, runs: list[str], signals: bytes) -> PackedResults:
     """Results of runs whose signals are one object, in parts of two bytes."""
-    complete = [CompleteRun(run, spec(), concluded(searched(5, 50, 0.5)), 1.0) for run in runs]
+    complete = [
+        CompleteRun(run, spec(), conclude_run(make_run_state(5, 50, 0.5)), 1.0) for run in runs
+    ]
     plain = ResultEncoder("sqlite", keeps_signals=False)(complete, {})
     name = sha256(signals).hexdigest()
     tables = [list(rows) for rows in plain.rows]
@@ -532,9 +534,9 @@ def test_signals_that_the_store_refuses_cost_no_result_and_are_told(
 
 def test_a_run_that_has_ended_already_keeps_its_result_and_counts_once(desk: Desk) -> None:
     first, second = desk.runs[:2]
-    desk.tell_result(first, searched(5, 50, 0.5))
+    desk.tell_result(first, make_run_state(5, 50, 0.5))
     desk.recorder.write_all()
-    results = {run: concluded(searched(9, 90, 0.7)) for run in (first, second)}
+    results = {run: conclude_run(make_run_state(9, 90, 0.7)) for run in (first, second)}
     desk.recorder.record_results(encode_results(results, desk.place.database))
     desk.recorder.write_all()
     rows = desk.place.runs(desk.job)[:2]
@@ -563,7 +565,7 @@ def test_many_results_are_written_in_several_transactions_each_once(
 
     monkeypatch.setattr(RunWriter, "record_results", record)
     for run in desk.runs:
-        desk.tell_result(run, searched(5, 50, 0.5))
+        desk.tell_result(run, make_run_state(5, 50, 0.5))
     if is_refused:
         with pytest.raises(ConnectionError):
             desk.recorder.finish_job()
@@ -580,18 +582,18 @@ def test_of_many_runs_that_begin_the_first_are_marked_and_the_others_later(
     _, second, third, _ = desk.runs
     for run in desk.runs:
         desk.recorder.record_start(run)
-    desk.tell_result(second, searched(5, 50, 0.5))
+    desk.tell_result(second, make_run_state(5, 50, 0.5))
     expected = [JobState.RUNNING, JobState.SUCCEEDED, JobState.QUEUED, JobState.QUEUED]
     desk.recorder.write_due()
     assert desk.states() == expected
-    desk.tell_result(third, searched(5, 50, 0.5))
+    desk.tell_result(third, make_run_state(5, 50, 0.5))
     desk.write_after(RESULTS_SECONDS + 0.1)
     assert desk.states()[2:] == [JobState.SUCCEEDED, JobState.RUNNING]
 
 
 def test_results_of_another_jobs_runs_change_nothing(desk: Desk) -> None:
     other = desk.place.runs(desk.place.submit())[0].id
-    desk.tell_result(other, searched(5, 50, 0.5))
+    desk.tell_result(other, make_run_state(5, 50, 0.5))
     desk.recorder.write_all()
     assert desk.place.job(desk.job).n_done == 0
     with desk.place.database.read_session() as session:
@@ -604,8 +606,8 @@ def test_under_a_lost_lease_nothing_is_written_and_the_recorder_learns_it(desk: 
     desk.recorder.record_start(desk.runs[0])
     with pytest.raises(LeaseLost):
         desk.recorder.write_due()
-    desk.tell_result(desk.runs[0], searched(5, 50, 0.5))
-    desk.tell_progress(desk.runs[1], searched(5, 50, 0.5), 0.2)
+    desk.tell_result(desk.runs[0], make_run_state(5, 50, 0.5))
+    desk.tell_progress(desk.runs[1], make_run_state(5, 50, 0.5), 0.2)
     for write in (
         desk.recorder.write_due,
         desk.recorder.cancel_parcel,

@@ -14,8 +14,8 @@ from service.storage.tables import Run
 from sysid.core.value_documents import encode
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.results.result import Agreements
-from tests.results import build_estimate, write_result
-from tests.stored import claimed, new_run, runs_of, submit
+from tests.support.storage.job_rows import new_run, runs_of, submit, submit_and_claim
+from tests.support.storage.run_results import build_estimate, write_result
 
 WARNINGS = ["T and L not separable"]
 ONSETS = (OnsetDelay(0, "u", "y", 0.5),)
@@ -26,17 +26,17 @@ RESULT = write_result(
 )
 
 
-def accepted(database, name, run, **more):
+def accept_reference(database, name, run, **more):
     with database.write_session() as session:
         return ReferenceRepository(session).accept_run(name, run, **more).number
 
 
 def test_the_latest_acceptance_is_in_use_and_the_others_stay(database):
-    _, runs = claimed(database, n_runs=3)
-    assert [accepted(database, "tube", run, accepted_by="me") for run in runs[:2]] == [1, 2]
-    assert accepted(database, "tube", runs[1]) == 2  # the one in use
-    assert accepted(database, "tube", runs[0]) == 3  # an earlier one again
-    accepted(database, "other", runs[2], note="narrow")
+    _, runs = submit_and_claim(database, n_runs=3)
+    assert [accept_reference(database, "tube", run, accepted_by="me") for run in runs[:2]] == [1, 2]
+    assert accept_reference(database, "tube", runs[1]) == 2  # the one in use
+    assert accept_reference(database, "tube", runs[0]) == 3  # an earlier one again
+    accept_reference(database, "other", runs[2], note="narrow")
     with database.read_session() as session:
         repository = ReferenceRepository(session)
         history = repository.list_history("tube")
@@ -52,12 +52,12 @@ def test_the_latest_acceptance_is_in_use_and_the_others_stay(database):
 
 
 def test_the_same_run_again_is_kept_where_it_is_said_by_another_or_why(database):
-    _, (run,) = claimed(database)
-    assert accepted(database, "tube", run, note="first") == 1
-    assert accepted(database, "tube", run, note="first") == 1
-    assert accepted(database, "tube", run) == 1  # nothing new is said
-    assert accepted(database, "tube", run, note="second") == 2
-    assert accepted(database, "tube", run, accepted_by="me", note="second") == 3
+    _, (run,) = submit_and_claim(database)
+    assert accept_reference(database, "tube", run, note="first") == 1
+    assert accept_reference(database, "tube", run, note="first") == 1
+    assert accept_reference(database, "tube", run) == 1  # nothing new is said
+    assert accept_reference(database, "tube", run, note="second") == 2
+    assert accept_reference(database, "tube", run, accepted_by="me", note="second") == 3
     with database.read_session() as session:
         repository = ReferenceRepository(session)
         assert repository.get_latest("tube").number == 3
@@ -69,10 +69,10 @@ def test_the_same_run_again_is_kept_where_it_is_said_by_another_or_why(database)
 
 
 def test_references_are_listed_page_by_page_without_the_results_of_their_runs(database):
-    claim, runs = claimed(database, n_runs=5)
+    claim, runs = submit_and_claim(database, n_runs=5)
     for number, run in enumerate(runs):
-        accepted(database, f"n{number}", runs[0])
-        accepted(database, f"n{number}", run)
+        accept_reference(database, f"n{number}", runs[0])
+        accept_reference(database, f"n{number}", run)
     found, cursor = [], None
     with database.read_session() as session:
         repository = ReferenceRepository(session)
@@ -89,8 +89,10 @@ def test_references_are_listed_page_by_page_without_the_results_of_their_runs(da
 
 
 def test_acceptances_at_once_have_numbers_of_their_own(database):
-    _, runs = claimed(database, n_runs=6)
-    threads = [threading.Thread(target=accepted, args=(database, "tube", run)) for run in runs]
+    _, runs = submit_and_claim(database, n_runs=6)
+    threads = [
+        threading.Thread(target=accept_reference, args=(database, "tube", run)) for run in runs
+    ]
     for one in threads:
         one.start()
     for one in threads:

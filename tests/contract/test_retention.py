@@ -37,7 +37,7 @@ from service.upkeep.retention import (
     purge_deleted_jobs,
 )
 from tests.contract.test_items import add_dataset, add_job, end_job
-from tests.stored import runs_of
+from tests.support.storage.job_rows import runs_of
 
 AT_ONCE = timedelta(seconds=-5)
 DONE = (JobState.SUCCEEDED,)

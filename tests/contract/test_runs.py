@@ -9,7 +9,14 @@ from service.repositories.history import HistoryPoint, MigrantPoint
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.errors import InvalidCursor, RowNotFound, UnstorableValue
-from tests.stored import claimed, job_of, new_run, record_outcomes, runs_of, submit
+from tests.support.storage.job_rows import (
+    job_of,
+    new_run,
+    record_outcomes,
+    runs_of,
+    submit,
+    submit_and_claim,
+)
 
 RESULT = {
     "parameters": [
@@ -46,13 +53,13 @@ def sweep(database, cells):
     return got
 
 
-def numbers(database, job_id, **filters):
+def read_numbers(database, job_id, **filters):
     with database.read_session() as session:
         return [run.number for run in RunRepository(session).list_page(job_id, **filters).items]
 
 
 def test_runs_are_made_in_bulk_and_a_second_time_changes_nothing(database):
-    got, before = claimed(database, n_runs=1500)
+    got, before = submit_and_claim(database, n_runs=1500)
     with database.write_session() as session:
         ledger = RunWriter(session, got.lease)
         ledger.create_runs(new_run(number=i) for i in range(1500))
@@ -77,7 +84,7 @@ def test_runs_can_be_made_with_their_job(database):
 
 
 def test_pending_runs_come_in_order_and_in_parts(database):
-    got, ids = claimed(database, n_runs=5)
+    got, ids = submit_and_claim(database, n_runs=5)
     with database.write_session() as session:
         ledger = RunWriter(session, got.lease)
         first = ledger.list_pending(limit=2)
@@ -86,7 +93,7 @@ def test_pending_runs_come_in_order_and_in_parts(database):
 
 
 def test_started_runs_carry_the_attempt_that_started_them(database):
-    got, ids = claimed(database, n_runs=2)
+    got, ids = submit_and_claim(database, n_runs=2)
     with database.write_session() as session:
         RunWriter(session, got.lease).start_runs(ids[:1])
     first, second = runs_of(database, got.job.id)
@@ -97,7 +104,7 @@ def test_started_runs_carry_the_attempt_that_started_them(database):
 
 @pytest.mark.parametrize("end", [JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED])
 def test_a_run_that_has_ended_is_not_started_again(database, end):
-    got, (run_id, other) = claimed(database, n_runs=2)
+    got, (run_id, other) = submit_and_claim(database, n_runs=2)
     record_outcomes(database, got.lease, RunOutcome(run_id=run_id, state=end))
     with database.write_session() as session:
         RunWriter(session, got.lease).start_runs([run_id, other])
@@ -106,8 +113,8 @@ def test_a_run_that_has_ended_is_not_started_again(database, end):
 
 
 def test_writes_under_one_lease_change_no_run_of_another_job(database):
-    _, (foreign,) = claimed(database)
-    got, (own,) = claimed(database)
+    _, (foreign,) = submit_and_claim(database)
+    got, (own,) = submit_and_claim(database)
     with database.write_session() as session:
         writer = RunWriter(session, got.lease)
         writer.start_runs([foreign, own])
@@ -121,7 +128,7 @@ def test_writes_under_one_lease_change_no_run_of_another_job(database):
 
 
 def test_checkpoints_are_read_for_one_job(database):
-    (first, (a,)), (second, (b,)) = claimed(database), claimed(database)
+    (first, (a,)), (second, (b,)) = submit_and_claim(database), submit_and_claim(database)
     for got, run in ((first, a), (second, b)):
         with database.write_session() as session:
             RunWriter(session, got.lease).save_checkpoints([(run, 10, run.encode())])
@@ -130,7 +137,7 @@ def test_checkpoints_are_read_for_one_job(database):
 
 
 def test_a_result_is_stored_whole_with_the_columns_that_lists_use(database):
-    got, (run_id,) = claimed(database)
+    got, (run_id,) = submit_and_claim(database)
     assert record_outcomes(database, got.lease, good(run_id)) == (run_id,)
     with database.read_session() as session:
         run = RunRepository(session).get(run_id)
@@ -144,7 +151,7 @@ def test_a_result_is_stored_whole_with_the_columns_that_lists_use(database):
 
 
 def test_a_result_is_written_exactly_once(database):
-    got, (run_id,) = claimed(database)
+    got, (run_id,) = submit_and_claim(database)
     record_outcomes(database, got.lease, good(run_id, 0.01))
     assert record_outcomes(database, got.lease, good(run_id, 0.005)) == ()
     (run,) = runs_of(database, got.job.id)
@@ -154,7 +161,7 @@ def test_a_result_is_written_exactly_once(database):
 
 
 def test_a_job_counts_its_finished_and_failed_runs_and_keeps_the_least_rms(database):
-    got, ids = claimed(database, n_runs=4)
+    got, ids = submit_and_claim(database, n_runs=4)
     record_outcomes(database, got.lease, good(ids[0], 0.3), good(ids[1], 0.2))
     record_outcomes(
         database, got.lease, RunOutcome(run_id=ids[2], state=JobState.FAILED, error="diverged")
@@ -173,13 +180,13 @@ def test_a_job_counts_its_finished_and_failed_runs_and_keeps_the_least_rms(datab
 
 
 def test_a_run_of_another_job_is_not_written(database):
-    _, (foreign,) = claimed(database)
-    got, _ = claimed(database)
+    _, (foreign,) = submit_and_claim(database)
+    got, _ = submit_and_claim(database)
     assert record_outcomes(database, got.lease, good(foreign)) == ()
 
 
 def test_results_and_history_stand_or_fall_together(database):
-    got, ids = claimed(database, n_runs=2)
+    got, ids = submit_and_claim(database, n_runs=2)
     bad = HistoryPoint("run_none", 0, 0, 0, 0, 1.0, "start", [])
     with pytest.raises(Exception, match=r"(?i)foreign key"):
         record_outcomes(database, got.lease, good(ids[0]), history=[bad])
@@ -188,7 +195,7 @@ def test_results_and_history_stand_or_fall_together(database):
 
 
 def test_history_written_again_after_a_resume_changes_nothing(database):
-    got, (run_id,) = claimed(database)
+    got, (run_id,) = submit_and_claim(database)
     points = [
         HistoryPoint(run_id, island, number, 10 * number, 50, 1.0 / (number + 1), "genetic", [1.5])
         for island in range(2)
@@ -210,7 +217,7 @@ def test_history_written_again_after_a_resume_changes_nothing(database):
 
 
 def test_only_the_last_checkpoint_is_kept_and_a_finished_run_has_none(database):
-    got, (a, b) = claimed(database, n_runs=2)
+    got, (a, b) = submit_and_claim(database, n_runs=2)
     with database.write_session() as session:
         RunWriter(session, got.lease).save_checkpoints([(a, 10, b"\x00old"), (b, 10, b"b")])
         RunWriter(session, got.lease).save_checkpoints([(a, 20, b"\x00new")])
@@ -221,7 +228,7 @@ def test_only_the_last_checkpoint_is_kept_and_a_finished_run_has_none(database):
 
 
 def test_the_next_holder_goes_on_from_the_checkpoint(database):
-    got, (run_id,) = claimed(database)
+    got, (run_id,) = submit_and_claim(database)
     with database.write_session() as session:
         RunWriter(session, got.lease).save_checkpoints([(run_id, 10, b"half way")])
         LeaseQueue(session).release_job(got.lease)
@@ -231,7 +238,7 @@ def test_the_next_holder_goes_on_from_the_checkpoint(database):
 
 
 def test_pages_of_runs_follow_each_other_without_gap_or_repeat(database):
-    got, _ = claimed(database, n_runs=7)
+    got, _ = submit_and_claim(database, n_runs=7)
     seen, cursor = [], None
     while True:
         with database.read_session() as session:
@@ -246,7 +253,7 @@ def test_pages_of_runs_follow_each_other_without_gap_or_repeat(database):
 def test_pages_sorted_by_a_column_have_every_run_once_and_those_without_a_value_last(
     database, descending
 ):
-    got, ids = claimed(database, n_runs=7)
+    got, ids = submit_and_claim(database, n_runs=7)
     values = [0.3, 0.1, 0.3, None, 0.2, None, 0.3]
     record_outcomes(
         database, got.lease, *(good(i, rms) for i, rms in zip(ids, values, strict=True))
@@ -264,10 +271,10 @@ def test_pages_sorted_by_a_column_have_every_run_once_and_those_without_a_value_
 
 
 def test_a_cursor_from_elsewhere_is_refused(sqlite_database):
-    got, _ = claimed(sqlite_database)
+    got, _ = submit_and_claim(sqlite_database)
     for cursor in ("", "x", "[1]", "[1,2,3]", '["a",1]', "null", '[1,"b"]', "{}"):
         with pytest.raises(InvalidCursor, match="not a cursor"):
-            numbers(sqlite_database, got.job.id, cursor=cursor)
+            read_numbers(sqlite_database, got.job.id, cursor=cursor)
 
 
 AXES = [0, 0.1, 1, True, False, None, "0.1", "improved", ["a"], ["a", "b"], {"k": 1}, "true"]
@@ -276,26 +283,26 @@ AXES = [0, 0.1, 1, True, False, None, "0.1", "improved", ["a"], ["a", "b"], {"k"
 @pytest.mark.parametrize("place", range(len(AXES)), ids=[repr(value) for value in AXES])
 def test_runs_are_found_by_the_exact_value_of_an_axis(database, place):
     got = sweep(database, [{"/noise/sigma": value, "/seed": 3} for value in AXES])
-    assert numbers(database, got.job.id, cell={"/noise/sigma": AXES[place]}) == [place]
+    assert read_numbers(database, got.job.id, cell={"/noise/sigma": AXES[place]}) == [place]
 
 
 def test_whole_and_broken_numbers_of_an_axis_are_the_same(database):
     got = sweep(database, [{"/noise/sigma": 0}, {"/noise/sigma": 0.0}, {"/noise/sigma": 2.0}])
-    assert numbers(database, got.job.id, cell={"/noise/sigma": 0.0}) == [0, 1]
-    assert numbers(database, got.job.id, cell={"/noise/sigma": 2}) == [2]
+    assert read_numbers(database, got.job.id, cell={"/noise/sigma": 0.0}) == [0, 1]
+    assert read_numbers(database, got.job.id, cell={"/noise/sigma": 2}) == [2]
 
 
 def test_filters_hold_together(database):
     cells = [{"/seed": seed, "/x": x} for seed in range(2) for x in ("a", 'b"\\')]
     got = sweep(database, cells)
-    assert numbers(database, got.job.id, cell={"/seed": 1, "/x": 'b"\\'}) == [3]
-    assert numbers(database, got.job.id, labels={"length_m": 0}) == [0, 2]
-    assert numbers(database, got.job.id, cell={"/none": 1}) == []
-    assert numbers(database, got.job.id, states=[JobState.SUCCEEDED]) == []
+    assert read_numbers(database, got.job.id, cell={"/seed": 1, "/x": 'b"\\'}) == [3]
+    assert read_numbers(database, got.job.id, labels={"length_m": 0}) == [0, 2]
+    assert read_numbers(database, got.job.id, cell={"/none": 1}) == []
+    assert read_numbers(database, got.job.id, states=[JobState.SUCCEEDED]) == []
 
 
 def test_another_projects_runs_are_not_seen(database):
-    got, (run_id,) = claimed(database)
+    got, (run_id,) = submit_and_claim(database)
     with database.read_session() as session:
         foreign = RunRepository(session, "proj_other")
         assert foreign.list_page(got.job.id).items == ()
@@ -306,7 +313,7 @@ def test_another_projects_runs_are_not_seen(database):
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "a\x00b", "\ud800"])
 def test_a_document_that_not_every_database_can_keep_is_refused(database, value):
-    got, (run_id,) = claimed(database)
+    got, (run_id,) = submit_and_claim(database)
     bad = RunOutcome(
         run_id=run_id, state=JobState.SUCCEEDED, result={"parameters": [], "note": [value]}
     )
@@ -315,7 +322,7 @@ def test_a_document_that_not_every_database_can_keep_is_refused(database, value)
 
 
 def test_text_that_only_looks_like_an_escape_is_kept(database):
-    got, (run_id,) = claimed(database)
+    got, (run_id,) = submit_and_claim(database)
     text = "\\u0000 and \\\\u0000 and \N{GREEK SMALL LETTER SIGMA}\N{PILE OF POO}"
     record_outcomes(
         database,
@@ -333,8 +340,8 @@ def test_text_that_only_looks_like_an_escape_is_kept(database):
 
 
 def test_a_job_succeeds_although_runs_of_another_one_wait(database):
-    claimed(database, n_runs=2)
-    got, (run_id,) = claimed(database)
+    submit_and_claim(database, n_runs=2)
+    got, (run_id,) = submit_and_claim(database)
     record_outcomes(database, got.lease, good(run_id))
     with database.write_session() as session:
         LeaseQueue(session).finish_job(got.lease, JobState.SUCCEEDED)

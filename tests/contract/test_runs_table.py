@@ -11,7 +11,7 @@ from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
 from service.sweeps import table
-from tests.stored import claim, new_job, new_run
+from tests.support.storage.job_rows import claim, new_job, new_run
 
 EVIL = '=HYPERLINK("http://x","y")'
 
@@ -26,7 +26,7 @@ def submit(database: Database, n_runs: int, path: str = "/seed") -> str:
         return JobRepository(session).submit(new).job.id
 
 
-def ended(
+def end_job_with(
     database: Database, cells: list[NewRun], outcomes: dict[int, dict[str, float] | str]
 ) -> str:
     """A job whose runs of these numbers have estimates, or failed for a reason."""
@@ -55,35 +55,35 @@ def _outcome(run: str, told: dict[str, float] | str) -> RunOutcome:
     )
 
 
-def rows(database: Database, job: str) -> list[dict[str, str]]:
+def list_rows(database: Database, job: str) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO("".join(table.stream_table(database, job)))))
 
 
 def test_parameters_that_only_late_runs_have_are_in_the_table(database: Database) -> None:
     cells = [new_run(number=number) for number in range(1200)]
-    job = ended(database, cells, {0: {"K": 2.0}, 3: "no", 1199: {"K": 3.0, "late": 0.1}})
-    found = rows(database, job)
+    job = end_job_with(database, cells, {0: {"K": 2.0}, 3: "no", 1199: {"K": 3.0, "late": 0.1}})
+    found = list_rows(database, job)
     assert len(found) == 1200
     assert (found[1199]["K"], found[1199]["late"], found[0]["late"]) == ("3.0", "0.1", "")
     assert (found[3]["error"], found[3]["K"]) == ("no", "")
 
 
 def test_a_table_of_runs_without_estimates_has_no_columns_of_parameters(database: Database) -> None:
-    found = rows(database, ended(database, [new_run(number=0)], {}))
+    found = list_rows(database, end_job_with(database, [new_run(number=0)], {}))
     assert [one["state"] for one in found] == ["failed"]
     assert list(found[0])[-2:] == ["error", "/seed"]
 
 
 def test_no_text_of_a_user_is_a_formula_in_a_spreadsheet(database: Database) -> None:
     cells = [new_run(number=0), new_run(number=1)]
-    job = ended(database, cells, {0: EVIL, 1: "-2"})
-    assert [one["error"] for one in rows(database, job)] == [f"'{EVIL}", "-2"]
+    job = end_job_with(database, cells, {0: EVIL, 1: "-2"})
+    assert [one["error"] for one in list_rows(database, job)] == [f"'{EVIL}", "-2"]
     for text in ("+1+cmd|' /C calc'!A0", "-2*K", "@SUM(1)", "\t=1", "\r=1", "\n=1", "\uff1d1"):
-        [row] = rows(database, ended(database, [new_run(number=0)], {0: text}))
+        [row] = list_rows(database, end_job_with(database, [new_run(number=0)], {0: text}))
         assert row["error"] == f"'{text}".replace("\r", " ")
 
 
-def estimated(database: Database, job: str, told: Sequence[tuple[str, str, str]]) -> None:
+def add_estimates(database: Database, job: str, told: Sequence[tuple[str, str, str]]) -> None:
     """One run after the other, each with one estimate: name, unit and status."""
     got = claim(database)
     assert got is not None
@@ -116,8 +116,8 @@ def estimated(database: Database, job: str, told: Sequence[tuple[str, str, str]]
 
 def test_headings_have_units_and_estimates_their_status(database: Database) -> None:
     job = submit(database, n_runs=2)
-    estimated(database, job, [("L", "s", "identified"), ("K", "1", "at bound")])
-    first, second = rows(database, job)
+    add_estimates(database, job, [("L", "s", "identified"), ("K", "1", "at bound")])
+    first, second = list_rows(database, job)
     assert (first["L [s]"], first["stderr of L [s]"]) == ("0.5", "0.25")
     assert (first["status of L"], second["status of L"]) == ("identified", "")
     assert (second["K"], second["stderr of K"], second["status of K"]) == (
@@ -130,8 +130,8 @@ def test_headings_have_units_and_estimates_their_status(database: Database) -> N
 
 def test_a_parameter_of_two_units_has_columns_for_each(database: Database) -> None:
     job = submit(database, n_runs=2, path="/model")
-    estimated(database, job, [("T", "s", "identified"), ("T", "min", "fixed")])
-    first, second = rows(database, job)
+    add_estimates(database, job, [("T", "s", "identified"), ("T", "min", "fixed")])
+    first, second = list_rows(database, job)
     assert (first["T [s]"], first["T [min]"]) == ("0.5", "")
     assert (second["T [s]"], second["T [min]"]) == ("", "0.5")
     assert [one["status of T"] for one in (first, second)] == ["identified", "fixed"]

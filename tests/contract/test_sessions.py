@@ -12,11 +12,11 @@ from service.storage.errors import UnstorableValue
 from service.storage.open_storage import open_storage
 from service.storage.sessions import Database
 from service.storage.tables import DEFAULT_PROJECT, ApiKey, Base, Job, Project
-from tests.database import copy_sqlite_template
-from tests.stored import job_of, submit
+from tests.support.storage.databases import copy_sqlite_template
+from tests.support.storage.job_rows import job_of, submit
 
 
-def names(database):
+def list_names(database):
     with database.read_session() as session:
         return set(session.scalars(select(Project.id)))
 
@@ -24,7 +24,7 @@ def names(database):
 def test_a_writing_session_commits_at_its_end(database):
     with database.write_session() as session:
         session.add(Project(id="proj_a", name="a"))
-    assert names(database) == {DEFAULT_PROJECT, "proj_a"}
+    assert list_names(database) == {DEFAULT_PROJECT, "proj_a"}
 
 
 def test_a_writing_session_that_fails_leaves_nothing(database):
@@ -36,7 +36,7 @@ def test_a_writing_session_that_fails_leaves_nothing(database):
 
     with pytest.raises(ZeroDivisionError):
         fail()
-    assert names(database) == {DEFAULT_PROJECT}
+    assert list_names(database) == {DEFAULT_PROJECT}
 
 
 def test_a_reading_session_cannot_write(database):
@@ -44,14 +44,14 @@ def test_a_reading_session_cannot_write(database):
         session.execute(text("DELETE FROM projects"))
     with database.write_session() as session:  # and the same connection can, afterwards
         session.add(Project(id="proj_a", name="a"))
-    assert "proj_a" in names(database)
+    assert "proj_a" in list_names(database)
 
 
 def test_readers_do_not_wait_for_a_writer(database):
     with database.write_session() as session:
         session.add(Project(id="proj_a", name="a"))
         session.flush()
-        assert names(database) == {DEFAULT_PROJECT}
+        assert list_names(database) == {DEFAULT_PROJECT}
 
 
 def test_writers_wait_for_each_other_and_none_is_lost(database):

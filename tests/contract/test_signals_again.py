@@ -18,10 +18,10 @@ from service.storage.errors import ObjectStoreFailed
 from service.storage.sessions import Database
 from service.storage.tables import Run
 from sysid.data.records import Recording
-from tests import polynomials
-from tests.dispatching import Place, carry_out
-from tests.inline_executor import InlineExecutor
-from tests.runs import step_record
+from tests.support.cluster.dispatch_place import Place, carry_out
+from tests.support.cluster.inline_executor import InlineExecutor
+from tests.support.cluster.small_runs import step_record
+from tests.support.library import polynomials
 
 SMALL = {"population": 16, "generations": 15, "islands": 1}
 SEEDS = {"axes": [{"path": "/seed", "range": [0, 2]}]}

@@ -11,7 +11,7 @@ from service.repositories.summaries import SummaryQuantity, find_quietest_run, r
 from service.storage.errors import LeaseLost
 from service.storage.tables import DEFAULT_PROJECT, Job
 from service.sweeps.groups import QUANTILES_PER_MILLE, GroupKey, SweepGroups, aggregate_runs
-from tests.stored import job_of, runs_of, submit
+from tests.support.storage.job_rows import job_of, runs_of, submit
 
 SIGMA = GroupKey("axis", "/noise/sigma")
 METHOD = GroupKey("axis", "/algorithm/method")
@@ -29,7 +29,7 @@ def seeds(count):
     return {"path": "/seed", "range": [0, count]}
 
 
-def filled(database, axes, values):
+def add_ended_job(database, axes, values):
     """A job with these axes, whose runs gave these values; None: the run failed."""
     spec = {**BODY, "sweep": {"axes": axes}}
     submit(database, n_runs=len(values), spec=spec)
@@ -56,7 +56,7 @@ def filled(database, axes, values):
     return got.job.id
 
 
-def summary(database, job, keys, *, limit=100, project=DEFAULT_PROJECT):
+def read_summary(database, job, keys, *, limit=100, project=DEFAULT_PROJECT):
     groups = SweepGroups(job_of(database, job).spec, keys, limit)
     with database.read_session() as session:
         return aggregate_runs(read_run_table(session, job, project), groups)
@@ -65,8 +65,8 @@ def summary(database, job, keys, *, limit=100, project=DEFAULT_PROJECT):
 @pytest.mark.parametrize("count", [1, 2, 7, 100])
 def test_quantiles_are_those_of_the_values(database, count):
     values = np.random.default_rng(count).random(count).tolist()
-    job = filled(database, [seeds(count)], values)
-    (whole,) = summary(database, job, [])
+    job = add_ended_job(database, [seeds(count)], values)
+    (whole,) = read_summary(database, job, [])
     expected = np.quantile(values, np.array(QUANTILES_PER_MILLE) / 1000)
     np.testing.assert_allclose(whole.quantiles[RMS], expected, rtol=1e-12)
     np.testing.assert_allclose(whole.quantiles[LAG], 2 * expected, rtol=1e-12)
@@ -79,8 +79,8 @@ def test_groups_come_in_the_order_of_the_sweep_each_with_its_own_runs(database):
         {"path": "/algorithm/method", "values": ["simple", "improved"]},
         seeds(3),
     ]
-    job = filled(database, axes, [float(i) for i in range(18)])
-    found = summary(database, job, [SIGMA, METHOD])
+    job = add_ended_job(database, axes, [float(i) for i in range(18)])
+    found = read_summary(database, job, [SIGMA, METHOD])
     assert [one.key for one in found] == [
         (0.2, "simple"),
         (0.2, "improved"),
@@ -93,8 +93,8 @@ def test_groups_come_in_the_order_of_the_sweep_each_with_its_own_runs(database):
 
 
 def test_failed_runs_are_counted_and_enter_no_quantile(database):
-    job = filled(database, [seeds(4)], [1.0, None, 3.0, None])
-    (whole,) = summary(database, job, [])
+    job = add_ended_job(database, [seeds(4)], [1.0, None, 3.0, None])
+    (whole,) = read_summary(database, job, [])
     assert whole.states[JobState.SUCCEEDED] == 2
     assert whole.states[JobState.FAILED] == 2
     assert whole.n_valid == 2
@@ -105,23 +105,23 @@ def test_runs_may_be_grouped_by_a_label_and_by_values_that_are_no_numbers(databa
     model = {"name": "own", "form": "difference"}
     labels = [{"length_m": 0.0}, {"length_m": 5.0}, {"length_m": 0.0}]
     axis = {"path": "/model", "values": [model, "tube", "mine"], "labels": labels}
-    job = filled(database, [axis], [1.0, 2.0, 3.0])
-    by_model = summary(database, job, [GroupKey("axis", "/model")])
+    job = add_ended_job(database, [axis], [1.0, 2.0, 3.0])
+    by_model = read_summary(database, job, [GroupKey("axis", "/model")])
     assert [one.key for one in by_model] == [(model,), ("tube",), ("mine",)]
-    by_label = summary(database, job, [LABEL])
+    by_label = read_summary(database, job, [LABEL])
     assert [(one.key, one.quantiles[RMS][2]) for one in by_label] == [((0.0,), 2.0), ((5.0,), 2.0)]
 
 
 def test_a_quantity_that_no_run_has_gives_no_quantiles(database):
-    job = filled(database, [seeds(1)], [1.0])
-    (whole,) = summary(database, job, [])
+    job = add_ended_job(database, [seeds(1)], [1.0])
+    (whole,) = read_summary(database, job, [])
     assert set(whole.quantiles) == {RMS, SummaryQuantity("rms_noise_free"), LAG}
 
 
 def test_groups_beyond_the_limit_are_left_out(database):
     axes = [{"path": "/noise/sigma", "values": list(range(9))}, seeds(2)]
-    job = filled(database, axes, [float(i) for i in range(18)])
-    found = summary(database, job, [SIGMA], limit=4)
+    job = add_ended_job(database, axes, [float(i) for i in range(18)])
+    found = read_summary(database, job, [SIGMA], limit=4)
     assert [(one.key, one.quantiles[RMS][2]) for one in found] == [
         ((sigma,), 2 * sigma + 0.5) for sigma in range(4)
     ]
@@ -129,9 +129,9 @@ def test_groups_beyond_the_limit_are_left_out(database):
 
 def test_a_group_knows_between_which_deviations_its_noise_lies(database):
     axes = [{"path": "/noise/sigma", "values": [0.0, 0.5]}, seeds(2)]
-    job = filled(database, axes, [1.0] * 4)
-    assert [one.sigma for one in summary(database, job, [SIGMA])] == [(0.0, 0.0), (0.5, 0.5)]
-    assert [one.sigma for one in summary(database, job, [])] == [(0.0, 0.5)]
+    job = add_ended_job(database, axes, [1.0] * 4)
+    assert [one.sigma for one in read_summary(database, job, [SIGMA])] == [(0.0, 0.0), (0.5, 0.5)]
+    assert [one.sigma for one in read_summary(database, job, [])] == [(0.0, 0.5)]
 
 
 def test_runs_with_other_parameters_have_their_own_columns(database):
@@ -170,9 +170,9 @@ def test_the_quantiles_of_a_group_are_those_of_its_own_successes(database, keys)
         {"path": "/algorithm/method", "values": ["simple", "improved"]},
     ]
     values = [None if draws.random() < 0.2 else float(draws.random()) for _ in range(30)]
-    job = filled(database, axes, values)
+    job = add_ended_job(database, axes, values)
     cells = [run.cell for run in runs_of(database, job)]
-    found = summary(database, job, keys)
+    found = read_summary(database, job, keys)
     assert sum(sum(one.states.values()) for one in found) == 30
     for one in found:
         mine = [
@@ -192,7 +192,7 @@ def test_the_quietest_run_is_the_best_of_those_with_the_least_noise_in_its_cell(
         seeds(3),
     ]
     values = [0.1, 0.1, 0.1, 4.0, 2.0, None, 0.1, 0.1, 0.1, 5.0, 6.0, 5.0]
-    job = filled(database, axes, values)
+    job = add_ended_job(database, axes, values)
     with database.read_session() as session:
         found = [
             find_quietest_run(session, job, cell).number
@@ -203,8 +203,8 @@ def test_the_quietest_run_is_the_best_of_those_with_the_least_noise_in_its_cell(
 
 
 def test_runs_of_a_job_are_not_told_to_another_project(database):
-    job = filled(database, [{"path": "/noise/sigma", "values": [0.0]}], [1.0])
-    (group,) = summary(database, job, [SIGMA], project="proj_other")
+    job = add_ended_job(database, [{"path": "/noise/sigma", "values": [0.0]}], [1.0])
+    (group,) = read_summary(database, job, [SIGMA], project="proj_other")
     assert (group.states[JobState.SUCCEEDED], group.quantiles) == (0, {})
 
 

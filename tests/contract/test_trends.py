@@ -16,10 +16,10 @@ from service.storage.tables import Job, Run
 from service.trends.schemas import TrendOut
 from service.trends.trend import compute_trend
 from sysid.trends.trend import OutlierRule, compute_drift_limit
-from tests.database import record_statements
-from tests.dispatching import Place
-from tests.results import claim_job, conclude, write_results
-from tests.stored import parcel_of, record_outcomes
+from tests.support.cluster.dispatch_place import Place
+from tests.support.storage.databases import record_statements
+from tests.support.storage.job_rows import parcel_of, record_outcomes
+from tests.support.storage.run_results import claim_job, conclude, write_results
 
 LENGTHS = (1.0, 2.0, 4.0)
 
@@ -49,12 +49,12 @@ def batch(
     return job, runs
 
 
-def trend(place: Place, job: str, outliers: OutlierRule = "exclude") -> TrendOut:
+def read_trend(place: Place, job: str, outliers: OutlierRule = "exclude") -> TrendOut:
     with place.database.read_session() as session:
         return compute_trend(session, job, outliers)
 
 
-def drifts(found: TrendOut, kind: str) -> dict[tuple[str, float], Any]:
+def list_drifts(found: TrendOut, kind: str) -> dict[tuple[str, float], Any]:
     return {
         (quantity.name, point.x): drift
         for quantity in found.quantities
@@ -67,7 +67,7 @@ def drifts(found: TrendOut, kind: str) -> dict[tuple[str, float], Any]:
 def test_the_reference_run_is_compared_at_its_own_label_only(place: Place) -> None:
     _, runs = batch(place)
     job, _ = batch(place, {2.0: 0.03}, runs[2.0])
-    told = drifts(trend(place, job), "run")
+    told = list_drifts(read_trend(place, job), "run")
     assert set(told) == {("L", 2.0), ("T", 2.0)}
     assert told["L", 2.0].expected == pytest.approx(0.2)
     assert told["L", 2.0].z == pytest.approx(0.03 / (0.01 * 2**0.5))
@@ -76,10 +76,10 @@ def test_the_reference_run_is_compared_at_its_own_label_only(place: Place) -> No
 def test_the_limit_of_drift_counts_all_labels_and_quantities(place: Place) -> None:
     _, runs = batch(place)
     job, _ = batch(place, {4.0: 1.0}, runs[2.0])
-    found = trend(place, job)
+    found = read_trend(place, job)
     limit = compute_drift_limit(None, 2 * len(LENGTHS))
-    assert {drift.limit for drift in drifts(found, "run").values()} == {limit}
-    along = drifts(found, "trend")
+    assert {drift.limit for drift in list_drifts(found, "run").values()} == {limit}
+    along = list_drifts(found, "trend")
     assert len(along) == 2 * len(LENGTHS)
     assert {key for key, drift in along.items() if drift.drifted} == {("L", 4.0), ("T", 4.0)}
     assert along["L", 4.0].expected == pytest.approx(0.4)
@@ -88,7 +88,7 @@ def test_the_limit_of_drift_counts_all_labels_and_quantities(place: Place) -> No
 def test_an_outlier_moves_neither_its_own_law_nor_what_a_reference_expects(place: Place) -> None:
     lengths = (1.0, 2.0, 4.0, 5.0, 7.0, 8.0)
     first, runs = batch(place, {5.0: 3.0}, lengths=lengths)
-    found, counted = trend(place, first), trend(place, first, "include")
+    found, counted = read_trend(place, first), read_trend(place, first, "include")
     assert (found.outliers, counted.outliers) == ("exclude", "include")
     for quantity, other in zip(found.quantities, counted.quantities, strict=True):
         assert [p.x for p in quantity.points if p.is_outlier] == [5.0]
@@ -103,7 +103,7 @@ def test_an_outlier_moves_neither_its_own_law_nor_what_a_reference_expects(place
         assert f'<option value="{runs[5.0]}">' in text
         assert f'<option value="{runs[4.0]}" selected>' in text
     job, _ = batch(place, None, runs[2.0], lengths)
-    assert drifts(trend(place, job), "trend")["L", 5.0].expected == pytest.approx(0.5)
+    assert list_drifts(read_trend(place, job), "trend")["L", 5.0].expected == pytest.approx(0.5)
 
 
 def test_runs_that_have_not_succeeded_are_missing(place: Place) -> None:
@@ -117,12 +117,12 @@ def test_runs_that_have_not_succeeded_are_missing(place: Place) -> None:
     write_results(place.database, lease, {first: conclude(L=(0.1, 0.01))})
     outcome = RunOutcome(run_id=failed, state=JobState.FAILED, error="diverged")
     record_outcomes(place.database, lease, outcome)
-    found = trend(place, job)
+    found = read_trend(place, job)
     assert (found.missing, [label.x for label in found.labels]) == (2, [1.0])
     assert (found.failed, found.unended) == (1, 1)
     with place.database.write_session() as session:
         LeaseQueue(session).finish_job(lease, JobState.CANCELLED)
-    found = trend(place, job)
+    found = read_trend(place, job)
     assert (found.missing, found.failed, found.unended) == (2, 1, 0)
 
 
@@ -142,7 +142,7 @@ def test_a_deleted_run_of_a_resumed_batch_has_ended(place: Place) -> None:
     with place.database.write_session() as session:
         delete_item(session, "run", deleted)
         JobRepository(session).resume(job)
-    found = trend(place, job)
+    found = read_trend(place, job)
     # The third run waits, and the fourth has no row.
     assert (found.missing, found.failed, found.unended) == (3, 0, 2)
 
@@ -156,9 +156,9 @@ def end(place: Place, job: str) -> None:
 def test_the_trend_of_an_ended_batch_is_computed_once(place: Place) -> None:
     job, _ = batch(place)
     end(place, job)
-    first = trend(place, job)
+    first = read_trend(place, job)
     with record_statements(place.database) as statements:
-        assert trend(place, job) == first
+        assert read_trend(place, job) == first
     assert not [one for one, _ in statements if "FROM runs" in one]
 
 
@@ -166,19 +166,19 @@ def test_a_trend_has_the_names_under_which_its_reference_was_accepted_later(plac
     _, runs = batch(place)
     job, _ = batch(place, None, runs[2.0])
     end(place, job)
-    assert trend(place, job).reference_names == []
+    assert read_trend(place, job).reference_names == []
     with place.database.write_session() as session:
         ReferenceRepository(session).accept_run("tubes", runs[2.0])
-    assert trend(place, job).reference_names == ["tubes"]
+    assert read_trend(place, job).reference_names == ["tubes"]
 
 
 def test_a_trend_follows_the_batch_of_its_reference(place: Place) -> None:
     first, runs = batch(place)
     job, _ = batch(place, None, runs[2.0])
     end(place, job)
-    limit = drifts(trend(place, job), "trend")["L", 4.0].expected
+    limit = list_drifts(read_trend(place, job), "trend")["L", 4.0].expected
     assert limit == pytest.approx(0.4)
     with place.database.write_session() as session:  # as if a run of it had come later
         session.get_one(Run, runs[4.0]).state = JobState.FAILED
         session.get_one(Job, first).n_failed = 1
-    assert drifts(trend(place, job), "trend") == {}
+    assert list_drifts(read_trend(place, job), "trend") == {}

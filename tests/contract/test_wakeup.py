@@ -8,8 +8,8 @@ from sqlalchemy import text
 from service.queue.leases import LeaseQueue
 from service.queue.notifications import open_notifier
 from service.repositories.jobs import JobRepository
-from tests.limits import LIMIT_SECONDS
-from tests.stored import claimed, submit
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.storage.job_rows import submit, submit_and_claim
 
 LONG = LIMIT_SECONDS  # far beyond what a wake-up takes; a test that waits that long has failed
 
@@ -25,7 +25,7 @@ def later(act):
     return thread
 
 
-def elapsed(waker, seconds):
+def measure_wait(waker, seconds):
     start = time.monotonic()
     return waker.wait_for_change(seconds), time.monotonic() - start
 
@@ -46,7 +46,7 @@ def test_a_job_that_came_just_before_the_wait_is_not_missed(database):
 
 
 def test_jobs_that_come_back_wake_too(database):
-    got, _ = claimed(database)
+    got, _ = submit_and_claim(database)
     with open_notifier(database) as waker:
         settle(waker)
         with database.write_session() as session:
@@ -62,7 +62,7 @@ def test_jobs_that_come_back_wake_too(database):
 def test_without_news_the_wait_ends_by_the_clock(database):
     with open_notifier(database) as waker:
         settle(waker)
-        woken, seconds = elapsed(waker, 0.2)
+        woken, seconds = measure_wait(waker, 0.2)
     assert not woken
     assert seconds >= 0.2
 

@@ -18,8 +18,8 @@ from service.queue.leases import LeaseQueue
 from service.storage.tables import Run
 from sysid.core.errors import InvalidSettings
 from sysid.data.noise import Noise
-from tests.dispatching import carry_out
-from tests.inline_executor import InlineExecutor
+from tests.support.cluster.dispatch_place import carry_out
+from tests.support.cluster.inline_executor import InlineExecutor
 from workers.protocol import RunNotReady
 
 pytestmark = pytest.mark.slow
@@ -39,7 +39,7 @@ class KeepingExecutor(InlineExecutor):
         return super().submit_pack(pack)
 
 
-def carried_out(place, slots=1, **body):
+def carry_out_job(place, slots=1, **body):
     """The job's runs once it is over, and what each began with."""
     job, executor = place.submit(**{"algorithm": QUICK, **body}), KeepingExecutor(slots)
     carry_out(place, job, executor)
@@ -47,11 +47,11 @@ def carried_out(place, slots=1, **body):
     return runs, [executor.warm.get(run.id) for run in runs]
 
 
-def values(run):
+def read_values(run):
     return {name: one["value"] for name, one in run.estimates.items()}
 
 
-def chained(*axes, **changes):
+def build_chain(*axes, **changes):
     return {"sweep": {"axes": list(axes)}, "warm_start": "previous", **changes}
 
 
@@ -59,29 +59,29 @@ NOISE = {"path": "/noise/sigma", "values": [0.0, 0.01, 0.02]}
 
 
 def test_a_run_begins_with_the_estimates_of_the_one_before(place):
-    runs, warm = carried_out(place, **chained(NOISE))
-    assert warm == [(), (values(runs[0]),), (values(runs[1]),)]
+    runs, warm = carry_out_job(place, **build_chain(NOISE))
+    assert warm == [(), (read_values(runs[0]),), (read_values(runs[1]),)]
 
 
 def test_chains_of_crossed_axes_run_along_the_one_with_labels(place):
     labelled = {**NOISE, "labels": [{"x": 1}, {"x": 2}, {"x": 3}]}
-    runs, warm = carried_out(place, **chained(labelled, {"path": "/seed", "values": [1, 2]}))
+    runs, warm = carry_out_job(place, **build_chain(labelled, {"path": "/seed", "values": [1, 2]}))
     assert warm[:2] == [(), ()]
-    assert warm[2:] == [(values(one),) for one in runs[:4]]
-    runs, warm = carried_out(place, **chained({"path": "/seed", "values": [1, 2]}, labelled))
+    assert warm[2:] == [(read_values(one),) for one in runs[:4]]
+    runs, warm = carry_out_job(place, **build_chain({"path": "/seed", "values": [1, 2]}, labelled))
     assert [one == () for one in warm] == [True, False, False] * 2
 
 
 def test_the_result_of_a_chain_does_not_depend_on_how_many_work(place):
-    alone, _ = carried_out(place, 1, **chained(NOISE))
-    several, _ = carried_out(place, 4, **chained(NOISE))
-    assert [values(one) for one in alone] == [values(one) for one in several]
+    alone, _ = carry_out_job(place, 1, **build_chain(NOISE))
+    several, _ = carry_out_job(place, 4, **build_chain(NOISE))
+    assert [read_values(one) for one in alone] == [read_values(one) for one in several]
     assert [one.evaluations for one in alone] == [one.evaluations for one in several]
 
 
 def test_a_chain_computed_before_is_taken_over_whole(place):
-    before, _ = carried_out(place, **chained(NOISE, reuse=True))
-    after, warm = carried_out(place, **chained(NOISE, reuse=True))
+    before, _ = carry_out_job(place, **build_chain(NOISE, reuse=True))
+    after, warm = carry_out_job(place, **build_chain(NOISE, reuse=True))
     assert [one.result["reused_from"] for one in after] == [one.id for one in before]
     assert warm == [None, None, None]
 
@@ -89,32 +89,32 @@ def test_a_chain_computed_before_is_taken_over_whole(place):
 def test_behind_a_run_that_failed_the_last_that_succeeded_serves(place):
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(job_parts, "Noise", broken_second_time())
-        runs, warm = carried_out(place, **chained(NOISE))
+        runs, warm = carry_out_job(place, **build_chain(NOISE))
     assert [one.state for one in runs] == [JobState.SUCCEEDED, JobState.FAILED, JobState.SUCCEEDED]
-    assert warm[2] == (values(runs[0]),)
+    assert warm[2] == (read_values(runs[0]),)
 
 
 def broken_second_time():
     calls = iter(range(100))
 
-    def made(*arguments):
+    def make_noise(*arguments):
         if next(calls) == 1:
             raise InvalidSettings("/noise", "as told")
         return Noise(*arguments)
 
-    return made
+    return make_noise
 
 
 def test_an_earlier_run_seeds_all_cells_and_its_values_are_part_of_the_hash(place):
-    (first,), _ = carried_out(place)
-    runs, warm = carried_out(place, warm_start=first.id, sweep={"axes": [NOISE]})
-    assert warm == [(values(first),)] * 3
+    (first,), _ = carry_out_job(place)
+    runs, warm = carry_out_job(place, warm_start=first.id, sweep={"axes": [NOISE]})
+    assert warm == [(read_values(first),)] * 3
     assert runs[0].spec_hash != first.spec_hash
 
 
 def test_a_reference_means_the_run_accepted_when_the_job_was_submitted(place):
-    (first,), _ = carried_out(place)
-    (second,), _ = carried_out(place, seed=2)
+    (first,), _ = carry_out_job(place)
+    (second,), _ = carry_out_job(place, seed=2)
     with place.database.write_session() as session:
         accept_reference(session, "tube", ReferenceIn(run=first.id, by="me"))
     job = place.submit(warm_start="reference:tube")
@@ -126,7 +126,7 @@ def test_a_reference_means_the_run_accepted_when_the_job_was_submitted(place):
 
 
 def test_a_warm_start_that_is_not_there_is_told(place):
-    (first,), _ = carried_out(place)
+    (first,), _ = carry_out_job(place)
     with place.database.write_session() as session:
         accept_reference(session, "tube", ReferenceIn(run=first.id))
     for warm, said in [
@@ -142,7 +142,7 @@ def test_a_warm_start_that_is_not_there_is_told(place):
 
 
 def test_a_run_of_another_model_or_one_that_did_not_succeed_is_refused(place):
-    (first,), _ = carried_out(place)
+    (first,), _ = carry_out_job(place)
     open_job = place.submit()
     (waiting,) = place.runs(open_job)
     for warm, model, said in [
@@ -156,7 +156,7 @@ def test_a_run_of_another_model_or_one_that_did_not_succeed_is_refused(place):
 
 
 def test_a_run_in_another_unit_is_refused_unless_the_unit_is_that_of_its_data(place):
-    (first,), _ = carried_out(place)
+    (first,), _ = carry_out_job(place)
 
     def set_unit(name, unit):
         with place.database.write_session() as session:
@@ -194,34 +194,36 @@ def before_the_first_wait(place, body):
     ("axes", "first"), [([SEEDS, LABELLED], [0, 3]), ([LABELLED, SEEDS], [0, 1])]
 )
 def test_every_chain_begins_at_once_whichever_axis_goes_fastest(place, axes, first):
-    assert before_the_first_wait(place, chained(*axes)) == first
+    assert before_the_first_wait(place, build_chain(*axes)) == first
 
 
 def test_a_chain_begins_also_where_its_first_run_was_not_made_yet(place, monkeypatch):
     monkeypatch.setattr(submit, "CELLS_AT_SUBMISSION", 2)
     monkeypatch.setattr(job_runs, "CHUNK_ROWS", 2)
-    runs, warm = carried_out(place, **chained(SEEDS, LABELLED))
+    runs, warm = carry_out_job(place, **build_chain(SEEDS, LABELLED))
     assert [one == () for one in warm] == [True, False, False] * 2
     assert {run.state for run in runs} == {JobState.SUCCEEDED}
 
 
 def test_the_results_of_chains_do_not_depend_on_the_order_of_the_axes(place):
-    fastest, _ = carried_out(place, 2, **chained(SEEDS, LABELLED))
-    slowest, _ = carried_out(place, 1, **chained(LABELLED, SEEDS))
+    fastest, _ = carry_out_job(place, 2, **build_chain(SEEDS, LABELLED))
+    slowest, _ = carry_out_job(place, 1, **build_chain(LABELLED, SEEDS))
     assert by_cell(fastest) == by_cell(slowest)
 
 
 def by_cell(runs):
     cells = [tuple(run.cell[axis["path"]] for axis in (SEEDS, LABELLED)) for run in runs]
-    return {cell: (values(run), run.evaluations) for cell, run in zip(cells, runs, strict=True)}
+    return {
+        cell: (read_values(run), run.evaluations) for cell, run in zip(cells, runs, strict=True)
+    }
 
 
 def test_runs_that_begin_cold_do_not_wait_beside_those_that_follow_one_another(place):
     cold_or_warm = {"path": "/warm_start", "values": [None, "previous"]}
     axes = {"sweep": {"axes": [cold_or_warm, LABELLED]}}
     assert before_the_first_wait(place, axes) == [0, 3, 1, 2]
-    runs, warm = carried_out(place, **axes)
-    assert warm == [(), (), (), (), (values(runs[3]),), (values(runs[4]),)]
+    runs, warm = carry_out_job(place, **axes)
+    assert warm == [(), (), (), (), (read_values(runs[3]),), (read_values(runs[4]),)]
 
 
 def all_rows(session, claim):
@@ -231,7 +233,9 @@ def all_rows(session, claim):
 
 def statements_behind(place, n_failed):
     """SQL statements that it takes to learn what the last of a chain begins with."""
-    job = place.submit(**chained({"path": "/seed", "range": [0, n_failed + 2]}, algorithm=QUICK))
+    job = place.submit(
+        **build_chain({"path": "/seed", "range": [0, n_failed + 2]}, algorithm=QUICK)
+    )
     with place.database.write_session() as session:
         claim = LeaseQueue(session).claim_job("d1")
         rows = session.scalars(
@@ -251,7 +255,7 @@ def statements_behind(place, n_failed):
 
 
 def test_chains_of_an_earlier_attempt_go_on_each_from_its_own_runs(place):
-    place.submit(**chained(LABELLED, {"path": "/seed", "values": [1, 2, 3, 4]}))
+    place.submit(**build_chain(LABELLED, {"path": "/seed", "values": [1, 2, 3, 4]}))
     with place.database.write_session() as session:
         claim = LeaseQueue(session).claim_job("d1")
         rows = session.scalars(
@@ -276,13 +280,13 @@ def test_what_a_chain_goes_on_from_is_found_as_quickly_behind_many_failures(plac
 
 
 def test_a_chain_of_runs_that_fail_asks_the_database_for_none_of_them(place, monkeypatch):
-    def refused(*_):
+    def refuse_look(*_):
         raise AssertionError("an earlier attempt is looked for")
 
     def broken(body, **_):
         raise InvalidSettings("/algorithm", "as told")
 
-    monkeypatch.setattr(WarmStarts, "_read_last_success", refused)
+    monkeypatch.setattr(WarmStarts, "_read_last_success", refuse_look)
     monkeypatch.setattr(job_parts, "read_run_settings", broken)
-    runs, _ = carried_out(place, **chained({"path": "/seed", "range": [0, 50]}))
+    runs, _ = carry_out_job(place, **build_chain({"path": "/seed", "range": [0, 50]}))
     assert {one.state for one in runs} == {JobState.FAILED}

@@ -6,7 +6,7 @@ from typing import Any
 
 from service.jobs.schemas import JobIn
 from tests.documents.settings import replace_table
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 PAGE = ROOT / "docs" / "job.md"
 

@@ -16,7 +16,7 @@ from playwright.sync_api import Browser, sync_playwright
 from lagid import Channel, Client, simulate
 from tests.documents.painter import CHROMIUM
 from tests.documents.tutorials import Shell
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 PICTURES = ROOT / "docs"
 SERVE = "lagid serve --data-dir data &"

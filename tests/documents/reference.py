@@ -12,7 +12,7 @@ from sysid.models.catalogue.load import catalogue, copy_catalogue_document, load
 from sysid.models.equation_display import format_equations
 from tests.documents.painter import CHROMIUM, open_painter
 from tests.documents.responses import describe_case, draw_response
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 Document = Mapping[str, Any]
 TITLES = {

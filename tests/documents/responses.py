@@ -9,7 +9,7 @@ from sysid.core.text import bracket_unit
 from sysid.data.records import Channel
 from sysid.figures.theme import plotly_template, series_style
 from sysid.models.catalogue.load import load_model
-from tests.catalogue_cases import CASES, made
+from tests.support.library.catalogue_cases import CASES, make_record
 
 MAX_SAMPLES = 500
 INK = "#7f8890"  # readable on white and on black
@@ -19,7 +19,7 @@ def draw_response(name: str) -> Any:
     """Draw the record on which the model is tested, outputs above, inputs below."""
     model = load_model(name)
     case = CASES[name]
-    record = made(model, case)
+    record = make_record(model, case)
     rows = [group for group in (record.outputs, record.inputs) if group]
     figure = make_subplots(len(rows), 1, shared_xaxes=True, vertical_spacing=0.08)
     for row, channels in enumerate(rows, 1):

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from service.core.settings import Settings
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 PAGE = ROOT / "docs" / "settings.md"
 BEGIN, END = "<!-- begin: make docs -->\n", "<!-- end -->\n"

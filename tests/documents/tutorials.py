@@ -26,7 +26,7 @@ from typing import Any
 
 from service.pages.guides import list_notebooks
 from tests.documents.painter import open_painter
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 WIDTH = 100
 SHOWN_ADDRESS, SHOWN_FOLDER = "127.0.0.1:8000", "/home/anna/lab"

@@ -21,11 +21,11 @@ from playwright.sync_api import (
 
 from service.api.app import create_app
 from service.api.dependencies import Parts
-from tests.e2e.filled import Filled, copy_filled
-from tests.limits import LIMIT_SECONDS
-from tests.needs import report_missing
-from tests.rest import settings_of
-from tests.serving import serve_in_thread
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.requirements import report_missing
+from tests.support.service.filled_folder import FilledFolder, copy_filled
+from tests.support.service.web_app import settings_of
+from tests.support.service.web_server import serve_in_thread
 
 CHROMIUM = Path("/usr/bin/chromium")
 ARGUMENTS = [
@@ -59,7 +59,7 @@ class Server:
 class Site(Server):
     """The same, and what its data folder holds."""
 
-    filled: Filled
+    filled: FilledFolder
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,7 @@ from fastapi import FastAPI
 from playwright.sync_api import Browser
 
 from tests.e2e.conftest import LIMIT_MILLISECONDS, Site
-from tests.serving import serve_in_thread
+from tests.support.service.web_server import serve_in_thread
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

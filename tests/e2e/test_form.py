@@ -12,7 +12,7 @@ from playwright.sync_api import Page, expect
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
 from tests.e2e.conftest import Site, serve_folder
-from tests.limits import LIMIT_SECONDS
+from tests.support.limits import LIMIT_SECONDS
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -32,7 +32,7 @@ initial: {y: 0}
 """
 
 
-def opened(site: Site, page: Page, query: str = "") -> None:
+def open_form(site: Site, page: Page, query: str = "") -> None:
     page.goto(f"{site.url}/{query}#new")
     page.wait_for_function("() => document.querySelector('[name=equations]').value !== ''")
 
@@ -43,7 +43,7 @@ def write_own(page: Page, text: str) -> None:
 
 
 def test_an_unknown_name_in_an_equation_is_told_with_its_column(site: Site, page: Page) -> None:
-    opened(site, page)
+    open_form(site, page)
     write_own(page, EQUATIONS.replace("K*u(t - L)", "Kp*u(t - L)"))
     check = page.locator("#check")
     expect(check).to_contain_text("column 2")
@@ -55,7 +55,7 @@ def test_an_unknown_name_in_an_equation_is_told_with_its_column(site: Site, page
 
 
 def test_own_equations_are_submitted_with_bounds_and_channels(own_site: Site, page: Page) -> None:
-    opened(own_site, page, f"?dataset={own_site.filled.dataset}")
+    open_form(own_site, page, f"?dataset={own_site.filled.dataset}")
     write_own(page, EQUATIONS)
     expect(page.locator("#check")).to_contain_text("the model is valid")
     page.get_by_label("upper of L").fill("0,3")
@@ -79,7 +79,7 @@ def test_own_equations_are_submitted_with_bounds_and_channels(own_site: Site, pa
 
 
 def test_a_refused_request_is_told_at_the_field(site: Site, page: Page) -> None:
-    opened(site, page, f"?dataset={site.filled.dataset}")
+    open_form(site, page, f"?dataset={site.filled.dataset}")
     write_own(page, EQUATIONS)  # of the recording's units: nothing else is refused
     expect(page.locator("#check")).to_contain_text("the model is valid")
     page.get_by_label("output y").select_option("P2")
@@ -94,7 +94,7 @@ def test_a_refused_request_is_told_at_the_field(site: Site, page: Page) -> None:
 
 
 def test_a_comma_that_may_separate_thousands_is_refused_with_advice(site: Site, page: Page) -> None:
-    opened(site, page, f"?dataset={site.filled.dataset}")
+    open_form(site, page, f"?dataset={site.filled.dataset}")
     page.get_by_label("upper of T").fill("1,000")
     page.get_by_role("button", name="Identify").click()
     expect(page.get_by_label("upper of T")).to_have_attribute("aria-invalid", "true")
@@ -102,7 +102,7 @@ def test_a_comma_that_may_separate_thousands_is_refused_with_advice(site: Site, 
 
 
 def test_swapped_bounds_are_marked_both_and_told_once(site: Site, page: Page) -> None:
-    opened(site, page, f"?dataset={site.filled.dataset}")
+    open_form(site, page, f"?dataset={site.filled.dataset}")
     write_own(page, EQUATIONS)
     expect(page.locator("#check")).to_contain_text("the model is valid")
     page.get_by_label("output y").select_option("P2")
@@ -118,7 +118,7 @@ def test_swapped_bounds_are_marked_both_and_told_once(site: Site, page: Page) ->
 def test_a_csv_file_is_stored_and_chosen(own_site: Site, page: Page, tmp_path: Path) -> None:
     path = tmp_path / "step.csv"
     path.write_text("t [s],u [V],y [V]\n" + "".join(f"{n / 10},{n % 2},{n}\n" for n in range(20)))
-    opened(own_site, page)
+    open_form(own_site, page)
     page.get_by_label("or upload a recording").set_input_files(path)
     expect(page.locator("#upload-state")).to_contain_text("step.csv is stored")
     expect(page.locator("#dataset-facts")).to_have_text("u [V] · y [V]")
@@ -129,7 +129,7 @@ def test_a_file_that_cannot_be_used_is_told_with_its_place(
 ) -> None:
     path = tmp_path / "bad.csv"
     path.write_text("t,u,y\n0,1,2\n0.1,oops,2\n0.2,1,2\n")
-    opened(site, page)
+    open_form(site, page)
     page.get_by_label("or upload a recording").set_input_files(path)
     expect(page.locator('[data-fault="/datasets"]')).to_contain_text("oops")
 
@@ -139,7 +139,7 @@ def test_a_file_without_times_is_stored_with_its_sampling_period(
 ) -> None:
     path = tmp_path / "notime.csv"
     path.write_text("u;y\n" + "".join(f"{n % 2};{n},5\n" for n in range(20)))
-    opened(own_site, page)
+    open_form(own_site, page)
     page.get_by_label("or upload a recording").set_input_files(path)
     expect(page.locator('[data-fault="/datasets"]')).to_contain_text('field "sampling period"')
     page.get_by_label("sampling period [s]").fill("0.1")
@@ -150,7 +150,7 @@ def test_a_file_without_times_is_stored_with_its_sampling_period(
 
 
 def test_a_clone_starts_from_the_request_of_the_job(own_site: Site, page: Page) -> None:
-    opened(own_site, page, f"?clone={own_site.filled.finished}")
+    open_form(own_site, page, f"?clone={own_site.filled.finished}")
     expect(page.get_by_label("name of the job")).to_have_value("tube 40 m, pattern 1")
     expect(page.get_by_label("validation data")).to_have_value("0.3")
     expect(page.get_by_label("output p")).to_have_value("P2")
@@ -174,7 +174,7 @@ def test_a_clone_of_a_job_that_the_service_named_is_named_after_its_new_model(
     body |= {"channels": {"u": "P1", "y": "P2"}}
     answer = httpx.post(f"{own_site.url}/v1/jobs", json=body, timeout=LIMIT_SECONDS).json()
     assert answer["name"] == "my-tube on tube 40 m"
-    opened(own_site, page, f"?clone={answer['id']}")
+    open_form(own_site, page, f"?clone={answer['id']}")
     name = page.get_by_label("name of the job")
     expect(name).to_have_attribute("placeholder", answer["name"])
     write_own(page, EQUATIONS.replace("my-tube", "longer-tube"))
@@ -206,7 +206,7 @@ def test_a_clone_keeps_starts_scales_and_ties(own_site: Site, page: Page) -> Non
     }
     answer = httpx.post(f"{own_site.url}/v1/jobs", json=body, timeout=LIMIT_SECONDS)
     assert answer.status_code == 202, answer.text
-    opened(own_site, page, f"?clone={answer.json()['id']}")
+    open_form(own_site, page, f"?clone={answer.json()['id']}")
     expect(page.get_by_label("upper of y(0)", exact=True)).to_have_value("900")
     page.get_by_label("lower of y(0)", exact=True).fill("-3")
     page.get_by_role("button", name="Identify").click()
@@ -219,7 +219,7 @@ def test_a_clone_keeps_starts_scales_and_ties(own_site: Site, page: Page) -> Non
 def test_a_part_of_the_recording_is_chosen_in_its_plot_and_its_mean_subtracted(
     own_site: Site, page: Page
 ) -> None:
-    opened(own_site, page, f"?dataset={own_site.filled.dataset}&fit=fopdt")
+    open_form(own_site, page, f"?dataset={own_site.filled.dataset}&fit=fopdt")
     plot = page.locator("[data-preview]")
     expect(plot.locator(".scatterlayer .trace")).to_have_count(2)
     assert page.locator("table.jobs tbody tr").count() == 5  # the form's model filters no list

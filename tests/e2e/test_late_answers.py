@@ -9,14 +9,14 @@ from playwright.sync_api import BrowserContext, Page, Request, Route, expect
 
 from service.repositories.jobs import JobRepository
 from tests.e2e.conftest import Site
-from tests.e2e.filled import MODEL, end_running, progress
-from tests.e2e.test_form import EQUATIONS, opened, write_own
-from tests.limits import LIMIT_SECONDS
+from tests.e2e.test_form import EQUATIONS, open_form, write_own
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.service.filled_folder import MODEL, end_running, progress
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 
-class Held:
+class HeldAnswer:
     """Requests of a page that wait until they are let go, first come first."""
 
     def __init__(self, page: Page, pattern: str) -> None:
@@ -55,7 +55,7 @@ class Held:
 def test_a_model_chosen_before_does_not_replace_the_one_chosen_after(
     site: Site, page: Page, path: str
 ) -> None:
-    first = Held(page, r"/v1/models/tube$")
+    first = HeldAnswer(page, r"/v1/models/tube$")
     page.goto(f"{site.url}{path}")
     first.wait()
     page.locator("select[name=model]").select_option("actuator")
@@ -71,7 +71,7 @@ def test_nothing_can_be_typed_for_a_model_that_is_going_to_be_replaced(
 ) -> None:
     page.goto(f"{site.url}/new/noise-sweep")
     expect(page.get_by_label(re.compile(r"^true K\b"))).to_be_visible()  # of the tube
-    second = Held(page, r"/v1/models/fopdt$")
+    second = HeldAnswer(page, r"/v1/models/fopdt$")
     page.locator("select[name=model]").select_option("fopdt")
     expect(page.locator("[data-truth], [data-input], [data-parameter]")).to_have_count(0)
     second.let_go()
@@ -91,8 +91,8 @@ def test_channels_follow_the_model_that_is_chosen_after_the_recordings(
 
 
 def test_the_form_shows_the_model_that_was_chosen_last(site: Site, page: Page) -> None:
-    opened(site, page)
-    first = Held(page, r"/v1/models/sopdt$")
+    open_form(site, page)
+    first = HeldAnswer(page, r"/v1/models/sopdt$")
     page.locator("select[name=model]").select_option("sopdt")
     first.wait()
     page.locator("select[name=model]").select_option("actuator")
@@ -109,8 +109,8 @@ def test_an_upload_that_ends_late_neither_selects_itself_nor_reports(
     good, bad = tmp_path / "good.csv", tmp_path / "bad.csv"
     good.write_text("t,u,y\n" + "".join(f"{n / 10},{n % 2},{n}\n" for n in range(20)))
     bad.write_text("t,u,y\n0,1,2\n0.1,oops,2\n0.2,1,2\n")
-    opened(own_site, page)
-    uploads = Held(page, r"/v1/datasets\?name=")
+    open_form(own_site, page)
+    uploads = HeldAnswer(page, r"/v1/datasets\?name=")
     chosen, facts = page.locator("[name=dataset]"), page.locator("#dataset-facts")
     for late in (bad, good):
         page.get_by_label("or upload a recording").set_input_files(late)
@@ -133,8 +133,8 @@ def test_an_upload_that_ends_late_neither_selects_itself_nor_reports(
 def test_an_answer_about_an_earlier_text_is_not_one_about_the_text_that_is_there(
     site: Site, page: Page
 ) -> None:
-    opened(site, page)
-    asked = Held(page, r"/v1/models:check$")
+    open_form(site, page)
+    asked = HeldAnswer(page, r"/v1/models:check$")
     write_own(page, EQUATIONS)
     asked.let_go()
     expect(page.locator("#check")).to_have_text("checking…")
@@ -143,7 +143,7 @@ def test_an_answer_about_an_earlier_text_is_not_one_about_the_text_that_is_there
 
 
 def test_bounds_that_were_typed_outlive_a_change_of_the_equations(site: Site, page: Page) -> None:
-    opened(site, page)
+    open_form(site, page)
     write_own(page, EQUATIONS)
     expect(page.locator("#check")).to_contain_text("the model is valid")
     page.get_by_label("upper of L").fill("0.3")
@@ -162,7 +162,7 @@ def test_a_cloned_request_cannot_be_sent_before_all_of_it_is_there(
         "parameters": {"L": {"upper": 0.3}},
     }
     job = httpx.post(f"{own_site.url}/v1/jobs", json=body, timeout=LIMIT_SECONDS).json()["id"]
-    check = Held(page, r"/v1/models:check$")
+    check = HeldAnswer(page, r"/v1/models:check$")
     page.goto(f"{own_site.url}/?clone={job}#new")
     check.wait()
     button = page.locator("#job-form [type=submit]")
@@ -182,12 +182,12 @@ def test_a_cloned_request_cannot_be_sent_before_all_of_it_is_there(
 
 def test_a_request_waits_for_the_model_that_was_chosen(own_site: Site, scripted_page: Page) -> None:
     page = scripted_page
-    opened(own_site, page)
+    open_form(own_site, page)
     page.locator("[name=dataset]").select_option(own_site.filled.dataset)
     expect(page.locator("[data-signal]").first).to_be_attached()
     sent: list[Request] = []
     page.on("request", lambda one: sent.append(one) if one.method == "POST" else None)
-    model = Held(page, r"/v1/models/sopdt$")
+    model = HeldAnswer(page, r"/v1/models/sopdt$")
     page.locator("select[name=model]").select_option("sopdt")
     model.wait()
     page.locator("#job-form [type=submit]").click()

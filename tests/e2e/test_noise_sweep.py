@@ -8,8 +8,8 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.e2e.conftest import serve_folder
-from tests.identified import carried_out
-from tests.limits import LIMIT_SECONDS
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.service.local_runs import carry_out_job
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -38,7 +38,7 @@ def job(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         answer = httpx.post(url, json=BODY, timeout=LIMIT_SECONDS)
         assert answer.status_code == 202, answer.text
         name: str = answer.json()["id"]
-        carried_out(server.parts, name)
+        carry_out_job(server.parts, name)
         yield f"{server.url}/jobs/{name}"
 
 

@@ -13,7 +13,7 @@ from service.queue.queue_state import read_queue_state
 from service.repositories.jobs import JobRepository
 from sysid.figures.theme import plotly_template
 from tests.e2e.conftest import Site
-from tests.e2e.filled import TRUE, end_running, progress
+from tests.support.service.filled_folder import TRUE, end_running, progress
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

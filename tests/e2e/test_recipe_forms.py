@@ -8,7 +8,7 @@ from playwright.sync_api import Page, expect
 
 from service.repositories.jobs import JobRepository
 from tests.e2e.conftest import Site
-from tests.limits import LIMIT_SECONDS
+from tests.support.limits import LIMIT_SECONDS
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -19,7 +19,7 @@ def spec_of(site: Site, page: Page) -> dict[str, object]:
         return dict(JobRepository(session).get(page.url.rsplit("/", 1)[1]).spec)
 
 
-def opened_sweep(site: Site, page: Page, model: str = "fopdt") -> None:
+def open_sweep(site: Site, page: Page, model: str = "fopdt") -> None:
     page.goto(f"{site.url}/new/noise-sweep")
     page.locator("[name=model]").select_option(model)
     page.wait_for_selector("[data-truth=K]")
@@ -41,7 +41,7 @@ def test_a_sweep_tells_its_runs_before_it_is_submitted_and_makes_as_many(
         timeout=LIMIT_SECONDS,
     )
     assert simulated.status_code == 201
-    opened_sweep(own_site, page)
+    open_sweep(own_site, page)
     for name, value in {"K": "2", "T": "1", "L": "0.5", "y0": "0"}.items():
         page.get_by_label(re.compile(rf"^true {name}\b")).fill(value)
     page.get_by_label(re.compile("^input u")).fill("cos(t)")
@@ -65,7 +65,7 @@ def test_a_sweep_tells_its_runs_before_it_is_submitted_and_makes_as_many(
 
 
 def test_faults_of_a_sweep_stand_at_their_fields(own_site: Site, page: Page) -> None:
-    opened_sweep(own_site, page)
+    open_sweep(own_site, page)
     page.get_by_label("σ, as a list").fill("0, a tenth")
     page.get_by_role("button", name="Sweep").click()
     expect(page.locator('[data-fault="/sigma"]')).to_contain_text("tenth")

@@ -9,23 +9,23 @@ from fastapi import FastAPI
 from playwright.sync_api import Page, expect
 
 from service.api.app import create_app
-from tests.e2e.filled import Filled, copy_filled
-from tests.rest import settings_of
-from tests.serving import serve_in_thread
+from tests.support.service.filled_folder import FilledFolder, copy_filled
+from tests.support.service.web_app import settings_of
+from tests.support.service.web_server import serve_in_thread
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
-def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Filled]:
+def filled_folder(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FilledFolder]:
     folder = tmp_path_factory.mktemp("prefix")
     return folder, copy_filled(folder)
 
 
 @pytest.fixture(scope="module")
-def address(filled: tuple[Path, Filled]) -> Iterator[str]:
+def address(filled_folder: tuple[Path, FilledFolder]) -> Iterator[str]:
     """A server with the service below a path, and nothing beside it: all else is not found."""
-    inner = create_app(settings_of(filled[0], poll_seconds=0.05))
+    inner = create_app(settings_of(filled_folder[0], poll_seconds=0.05))
 
     @asynccontextmanager
     async def run(_: FastAPI) -> AsyncIterator[None]:
@@ -42,12 +42,12 @@ def address(filled: tuple[Path, Filled]) -> Iterator[str]:
 
 
 def test_pages_work_below_the_path_of_a_proxy(
-    address: str, filled: tuple[Path, Filled], scripted_page: Page
+    address: str, filled_folder: tuple[Path, FilledFolder], scripted_page: Page
 ) -> None:
     page = scripted_page
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url))
-    page.goto(f"{address}/jobs/{filled[1].finished}")
+    page.goto(f"{address}/jobs/{filled_folder[1].finished}")
     page.locator('[data-figure="history"]').scroll_into_view_if_needed()
     page.wait_for_selector('[data-figure="history"] .main-svg')
     page.get_by_role("link", name="Clone").click()
@@ -62,12 +62,12 @@ def test_pages_work_below_the_path_of_a_proxy(
 
 
 def test_items_are_found_edited_and_deleted_below_the_path(
-    address: str, filled: tuple[Path, Filled], scripted_page: Page
+    address: str, filled_folder: tuple[Path, FilledFolder], scripted_page: Page
 ) -> None:
     page = scripted_page
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url))
-    page.goto(f"{address}/jobs/{filled[1].failed}")
+    page.goto(f"{address}/jobs/{filled_folder[1].failed}")
     page.get_by_role("button", name="Edit").first.click()
     dialog = page.get_by_role("dialog", name="Edit the job")
     dialog.get_by_label("Tags").fill("suspect")

@@ -9,7 +9,7 @@ from playwright.sync_api import Browser, Page, expect
 from service.access.keys import create_key
 from service.storage.tables import DEFAULT_PROJECT
 from tests.e2e.conftest import LIMIT_MILLISECONDS, Site, serve_folder
-from tests.e2e.filled import copy_filled, progress
+from tests.support.service.filled_folder import copy_filled, progress
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

@@ -6,7 +6,7 @@ import pytest
 from playwright.sync_api import BrowserContext, Error, Page
 
 from tests.e2e.conftest import VIEWPORT, watch_tab
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 
 def change_tab(tab: Page) -> None:

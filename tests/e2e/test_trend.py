@@ -7,10 +7,10 @@ import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.batches import LENGTHS, copy_batch
 from tests.e2e.conftest import serve_folder
 from tests.e2e.test_late_answers import LIVE
-from tests.limits import LIMIT_SECONDS
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.service.tube_batch import LENGTHS, copy_batch
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-from tests.standing import Service
+from tests.support.service.whole_service import Service
 
 pytestmark = [
     pytest.mark.browser,
@@ -20,7 +20,7 @@ K, T, L, STEP = 2.0, 0.35, 0.12, 0.02
 LAST = "plot => Math.max(0, ...(plot.data ?? []).flatMap(trace => trace.x))"
 
 
-def recording(path: Path) -> Path:
+def make_recording(path: Path) -> Path:
     """A first-order lag behind a dead time, integrated exactly between the samples, as CSV."""
     times = np.arange(600) * STEP
     u = np.where(times % 3 < 1.5, 1.0, -0.5)
@@ -35,7 +35,7 @@ def recording(path: Path) -> Path:
     return path
 
 
-def filled_in(service: Service, page: Page, path: Path, name: str) -> None:
+def fill_in_form(service: Service, page: Page, path: Path, name: str) -> None:
     page.goto(f"{service.stand.url}/#new")
     page.wait_for_function("() => document.querySelector('[name=equations]').value !== ''")
     page.get_by_label("or upload a recording").set_input_files(path)
@@ -64,7 +64,7 @@ def test_a_file_becomes_estimates_with_their_errors_without_a_mouse(
     page.wait_for_function("() => !document.getElementById('job-form').inert")
     upload = page.get_by_label("or upload a recording")
     press_tab_to(page, upload)
-    upload.set_input_files(recording(tmp_path / "step.csv"))  # the dialog is the system's
+    upload.set_input_files(make_recording(tmp_path / "step.csv"))  # the dialog is the system's
     expect(page.locator("#dataset-facts")).to_have_text("u [V] · y [V]")
     model = page.get_by_role("combobox", name="Model", exact=True)
     press_tab_to(page, model)
@@ -92,7 +92,7 @@ def test_a_file_becomes_estimates_with_their_errors_without_a_mouse(
 def test_a_long_search_is_watched_and_cancelled(
     service: Service, page: Page, tmp_path: Path
 ) -> None:
-    filled_in(service, page, recording(tmp_path / "step.csv"), "long")
+    fill_in_form(service, page, make_recording(tmp_path / "step.csv"), "long")
     page.get_by_label("generations").fill("10000000")
     page.get_by_label("method").select_option("simple")
     page.get_by_role("button", name="Identify").click()

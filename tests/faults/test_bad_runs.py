@@ -5,7 +5,7 @@ import pytest
 from benchmarks.breaking.work import DEADLY, GREEDY
 from service.client.calls import ProblemError
 from service.core.states import JobState
-from tests.standing import Service
+from tests.support.service.whole_service import Service
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(400)]
 

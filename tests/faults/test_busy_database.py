@@ -14,9 +14,9 @@ from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.leases import HeldLeases
 from service.queue.orphaned_jobs import reap_jobs
 from service.storage.columns import utc_now
-from tests.dispatching import Place, until
-from tests.inline_executor import InlineExecutor
-from tests.stored import parcels_of
+from tests.support.cluster.dispatch_place import Place, until
+from tests.support.cluster.inline_executor import InlineExecutor
+from tests.support.storage.job_rows import parcels_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

@@ -7,8 +7,14 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.deployment import BUCKET, WORKER_HOST, Deployment, open_client, rehearse_deployment
-from tests.rest import CSV, recording
+from tests.support.cluster.deployment import (
+    BUCKET,
+    WORKER_HOST,
+    Deployment,
+    open_client,
+    rehearse_deployment,
+)
+from tests.support.service.web_app import CSV, recording
 
 pytestmark = [
     pytest.mark.ray,

@@ -12,8 +12,8 @@ from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.storage.errors import LeaseLost
 from service.storage.sessions import Database
-from tests.limits import LIMIT_SECONDS
-from tests.stored import job_of, new_run, runs_of, submit
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.storage.job_rows import job_of, new_run, runs_of, submit
 
 pytestmark = pytest.mark.slow  # processes of their own
 
@@ -73,7 +73,7 @@ def _dispatch(url, owner, trouble, before, claimed, refused):
         trouble = ""
 
 
-def _finished(database, jobs):
+def _are_finished(database, jobs):
     return all(job_of(database, job_id).state.is_terminal for job_id in jobs)
 
 
@@ -93,7 +93,7 @@ def test_each_run_has_one_result_though_dispatchers_die_and_stall(database):
         process.start()
     limit = time.monotonic() + LIMIT_SECONDS
     try:
-        while not _finished(database, jobs) and time.monotonic() < limit:
+        while not _are_finished(database, jobs) and time.monotonic() < limit:
             time.sleep(0.1)
         owner, late = refused.get(timeout=LIMIT_SECONDS)
         while owner != "stalling":  # on a busy machine the dying one may be late as well

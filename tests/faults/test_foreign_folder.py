@@ -13,11 +13,11 @@ from service.formats.sandbox import read_untrusted
 from sysid.core.child_processes import build_child_command, build_import_path
 from sysid.kernels.compilation import compile_kernel
 from sysid.kernels.layout import KernelVariant
-from tests.commands import check_refusal, run_lagid
-from tests.foreign_modules import ForeignFolder
-from tests.models import duffing
-from tests.repository import ROOT
-from tests.standing import Service
+from tests.support.checkout import ROOT
+from tests.support.files.foreign_modules import ForeignFolder
+from tests.support.library.small_models import duffing
+from tests.support.service.commands import check_refusal, run_lagid
+from tests.support.service.whole_service import Service
 from workers.ray_folders import get_inner_folder
 
 

@@ -11,10 +11,10 @@ import pytest
 from benchmarks.breaking.disks import fill_folders
 from benchmarks.breaking.stand import until
 from service.core.states import JobState
-from tests.limits import LIMIT_SECONDS
-from tests.repository import ROOT
-from tests.rest import CSV, PROBLEM
-from tests.standing import Service
+from tests.support.checkout import ROOT
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.service.web_app import CSV, PROBLEM
+from tests.support.service.whole_service import Service
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(400)]
 

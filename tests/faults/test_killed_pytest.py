@@ -8,9 +8,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.dispatching import until
-from tests.guard import find_processes
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
+from tests.support.cluster.dispatch_place import until
+from tests.support.session_guard import find_processes
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.postgres, pytest.mark.timeout(300)]
 
@@ -18,8 +18,8 @@ TESTS = """
 import os, subprocess, sys, tempfile, time
 from pathlib import Path
 from benchmarks.breaking.disks import small_disk
-from tests.database import postgres_url
-from tests.guard import SESSION_VARIABLE
+from tests.support.storage.databases import postgres_url
+from tests.support.session_guard import SESSION_VARIABLE
 from workers.local_ray import LocalRay
 
 def test_waits(tmp_path):

@@ -26,14 +26,16 @@ from service.formats.mcap_messages import build_schema
 from service.formats.mcap_writer import MCAP_MAGIC
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
-from tests.limits import LIMIT_SECONDS
-from tests.mcap_files import foreign, json_messages, recorded
-from tests.profiles import scale_examples
+from tests.support.files.mcap_files import json_messages, write_foreign_bytes, write_mcap_bytes
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.profiles import scale_examples
 
 TIMES = np.arange(50) * 0.1
-OURS = recorded(Recording((Channel("u", TIMES, np.sin(TIMES)), Channel("y", TIMES, TIMES**2))))
+OURS = write_mcap_bytes(
+    Recording((Channel("u", TIMES, np.sin(TIMES)), Channel("y", TIMES, TIMES**2)))
+)
 FOREIGN = {
-    kind: foreign(
+    kind: write_foreign_bytes(
         json_messages("/a", *({"x": k, "y": k / 2} for k in range(20))),
         compression=kind,
     )
@@ -43,7 +45,7 @@ FILES = [OURS, *FOREIGN.values()]
 ONE_MIB = 1024**2
 
 
-def refused(content: bytes, limits: UploadLimits = DEFAULT_LIMITS) -> UnreadableFile:
+def read_refusal(content: bytes, limits: UploadLimits = DEFAULT_LIMITS) -> UnreadableFile:
     with pytest.raises(UnreadableFile) as caught:
         read_mcap_with_notes(content, limits)
     assert "\n" not in str(caught.value)
@@ -73,7 +75,7 @@ def chunk_of(content: bytes, compression: str, packed: bytes, size: int | None =
     return Chunk(compression, packed, 0, 0, zlib.crc32(content), declared)
 
 
-def joined(*records: McapRecord) -> bytes:
+def join_records(*records: McapRecord) -> bytes:
     return b"".join(map(as_bytes, records))
 
 
@@ -90,7 +92,7 @@ def flat_message(log_time: int, x: float, y: float) -> Message:
 
 def flat_file(*messages: Message) -> bytes:
     """File with all messages in one chunk that holds nothing else."""
-    content = joined(*messages)
+    content = join_records(*messages)
     return file_of(FLAT_SCHEMA, FLAT, chunk_of(content, "", content))
 
 
@@ -103,7 +105,7 @@ def test_the_parts_used_here_make_a_file_that_is_read() -> None:
 def test_a_file_cut_off_anywhere_is_refused_at_a_byte_of_it(content: bytes) -> None:
     places = {*range(60), *range(0, len(content), 7), *range(len(content) - 60, len(content))}
     for length in sorted(places):
-        error = refused(content[:length])
+        error = read_refusal(content[:length])
         assert error.byte is not None
         assert 0 <= error.byte <= length
 
@@ -112,13 +114,13 @@ def test_one_flipped_bit_anywhere_in_a_file_of_ours_is_found() -> None:
     for place in range(len(OURS)):
         damaged = bytearray(OURS)
         damaged[place] ^= 1 << place % 8
-        refused(bytes(damaged))
+        read_refusal(bytes(damaged))
 
 
 def test_a_damaged_summary_is_refused_by_its_checksum() -> None:
     damaged = bytearray(OURS)
     damaged[-len(MCAP_MAGIC) - 29 - 1] ^= 1  # last byte before the footer
-    assert "for the summary" in refused(bytes(damaged)).detail
+    assert "for the summary" in read_refusal(bytes(damaged)).detail
 
 
 BOMB_BYTES = 96 * ONE_MIB
@@ -132,7 +134,7 @@ def bomb(compression: str, declared: int) -> bytes:
     return file_of(CHANNEL, Chunk(compression, packed, 0, 0, 0, declared))
 
 
-def windowed(log: int) -> bytes:
+def write_with_window(log: int) -> bytes:
     """File with a right message in a zstd frame that asks for a window of 2ˡᵒᵍ bytes."""
     parameters = zstandard.ZstdCompressionParameters(window_log=log)
     packer = zstandard.ZstdCompressor(compression_params=parameters).compressobj()
@@ -145,14 +147,14 @@ def windowed(log: int) -> bytes:
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 @pytest.mark.parametrize("declared", [1000, 64 * ONE_MIB, 2**40])
 def test_a_bomb_is_refused(compression: str, declared: int) -> None:
-    assert "chunk record declares" in refused(bomb(compression, declared)).detail
+    assert "chunk record declares" in read_refusal(bomb(compression, declared)).detail
 
 
 def test_a_zstd_frame_that_asks_for_a_huge_window_is_refused() -> None:
-    recording, _ = read_mcap_with_notes(windowed(23), DEFAULT_LIMITS)
+    recording, _ = read_mcap_with_notes(write_with_window(23), DEFAULT_LIMITS)
     assert recording.channel("x").values[0] == 2
     for log in (24, 30):
-        assert "too much memory" in refused(windowed(log)).detail
+        assert "too much memory" in read_refusal(write_with_window(log)).detail
 
 
 READ_IN_LITTLE_MEMORY = """
@@ -176,11 +178,11 @@ for path in bombs:
 
 def test_a_bomb_needs_no_more_memory_than_it_declares(tmp_path: Path) -> None:
     files = {
-        "right": (windowed(23), ""),
+        "right": (write_with_window(23), ""),
         "zstd": (bomb("zstd", 1000), "declares 1000 bytes of content, but holds more"),
         "lz4": (bomb("lz4", 1000), "declares 1000 bytes of content, but holds more"),
         "huge": (bomb("zstd", 2**40), "at most 67108864"),
-        "window": (windowed(30), "requires too much memory"),
+        "window": (write_with_window(30), "requires too much memory"),
         "length": (file_of(b"\5" + struct.pack("<Q", 2**40)), "at most 67108864"),
     }
     for name, (content, _) in files.items():
@@ -207,7 +209,7 @@ def test_many_small_chunks_are_counted_together() -> None:
     )
     chunk = replace(chunk, uncompressed_crc=0)
     limits = replace(DEFAULT_LIMITS, total_bytes=100 * ONE_MIB)
-    assert "to more than" in refused(file_of(chunk, chunk), limits).detail
+    assert "to more than" in read_refusal(file_of(chunk, chunk), limits).detail
 
 
 MAP_PAST_ITS_LENGTH = struct.pack("<II", 0, 8) + struct.pack("<I", 1) + b"a" + bytes(4)
@@ -247,7 +249,7 @@ MAP_PAST_ITS_LENGTH = struct.pack("<II", 0, 8) + struct.pack("<I", 1) + b"a" + b
 def test_a_record_that_cannot_be_right_is_refused(
     records: tuple[McapRecord, ...], words: str
 ) -> None:
-    assert words in refused(file_of(*records)).detail
+    assert words in read_refusal(file_of(*records)).detail
 
 
 @pytest.mark.parametrize(
@@ -262,7 +264,7 @@ def test_a_record_that_cannot_be_right_is_refused(
     ],
 )
 def test_every_limit_is_kept(limits: UploadLimits, words: str) -> None:
-    assert words in refused(FOREIGN[CompressionType.ZSTD], limits).detail
+    assert words in read_refusal(FOREIGN[CompressionType.ZSTD], limits).detail
 
 
 @pytest.mark.parametrize(
@@ -279,35 +281,37 @@ def test_the_limits_hold_for_messages_that_are_read_as_one_array(
     content = flat_file(*(flat_message(k, k, -k) for k in range(4)))
     recording, _ = read_mcap_with_notes(content, DEFAULT_LIMITS)
     np.testing.assert_array_equal(recording.channel("y").values, [0, -1, -2, -3])
-    assert words in refused(content, limits).detail
+    assert words in read_refusal(content, limits).detail
 
 
 def test_a_time_beyond_the_clock_is_refused_in_an_array_of_messages_too() -> None:
-    assert "2⁶³" in refused(flat_file(flat_message(1, 0, 0), flat_message(2**63, 0, 0))).detail
+    assert "2⁶³" in read_refusal(flat_file(flat_message(1, 0, 0), flat_message(2**63, 0, 0))).detail
 
 
 def test_a_footer_that_denies_the_summary_is_refused() -> None:
-    error = refused(file_of(CHANNEL, MESSAGE, summary=(CHANNEL,)))
+    error = read_refusal(file_of(CHANNEL, MESSAGE, summary=(CHANNEL,)))
     assert "says that the summary begins at 0" in error.detail
 
 
 def test_a_record_longer_than_the_limit_is_refused_unread_whatever_it_holds() -> None:
     content = file_of(Metadata("notes", {"text": "x" * 2000}), CHANNEL, MESSAGE)
     assert read_mcap_with_notes(content, DEFAULT_LIMITS)[0].names == ("x",)
-    error = refused(content, replace(DEFAULT_LIMITS, record_bytes=1000))
+    error = read_refusal(content, replace(DEFAULT_LIMITS, record_bytes=1000))
     assert "the metadata record declares" in error.detail
     assert "at most 1000" in error.detail
 
 
 def test_the_number_of_channels_is_limited() -> None:
     channels = [replace(CHANNEL, id=number) for number in range(1, 5)]
-    assert "at most 3" in refused(file_of(*channels), replace(DEFAULT_LIMITS, channels=3)).detail
+    assert (
+        "at most 3" in read_refusal(file_of(*channels), replace(DEFAULT_LIMITS, channels=3)).detail
+    )
 
 
 def test_bytes_after_the_end_and_a_wrong_end_are_refused() -> None:
-    assert "after the end" in refused(OURS + b"\0").detail
-    assert "magic bytes" in refused(OURS[:-1] + b"x").detail
-    assert refused(b"PK\x03\x04 not mcap").byte == 0
+    assert "after the end" in read_refusal(OURS + b"\0").detail
+    assert "magic bytes" in read_refusal(OURS[:-1] + b"x").detail
+    assert read_refusal(b"PK\x03\x04 not mcap").byte == 0
 
 
 @pytest.mark.parametrize(
@@ -350,7 +354,7 @@ def test_a_manifest_that_cannot_be_right_is_refused(change: dict[str, str]) -> N
     good = file_of(Metadata("lagid.dataset", manifest), CHANNEL, MESSAGE, later)
     assert read_mcap_with_notes(good, DEFAULT_LIMITS)[0].names == ("u",)
     bad = file_of(Metadata("lagid.dataset", {**manifest, **change}), CHANNEL, MESSAGE, later)
-    refused(bad)
+    read_refusal(bad)
 
 
 @pytest.mark.parametrize("content", FILES)

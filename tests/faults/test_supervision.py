@@ -19,7 +19,7 @@ from service.dispatch.supervisor import (
     make_paths_absolute,
     to_environment,
 )
-from tests.limits import LIMIT_SECONDS
+from tests.support.limits import LIMIT_SECONDS
 
 # A child with a child of its own in another process group, as Ray's helpers are.
 CHILD = """

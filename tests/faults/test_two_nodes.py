@@ -11,9 +11,9 @@ import pytest
 
 from service.core.states import JobState
 from service.storage.tables import Run
-from tests.dispatching import Place, until
-from tests.limits import LIMIT_SECONDS
-from tests.two_nodes import two_nodes
+from tests.support.cluster.dispatch_place import Place, until
+from tests.support.cluster.two_nodes import two_nodes
+from tests.support.limits import LIMIT_SECONDS
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -37,22 +37,22 @@ def plain(place: Place, job: str) -> list[dict[str, Any]]:
     """What the job's runs give in this process, without Ray."""
     from service.dispatch.dispatcher import Dispatcher
     from service.dispatch.leases import HeldLeases
-    from tests.inline_executor import InlineExecutor
+    from tests.support.cluster.inline_executor import InlineExecutor
 
     dispatcher = Dispatcher(
         place.database, place.store, InlineExecutor(), HeldLeases(place.database, 30)
     )
     while not place.job(job).state.is_terminal:
         dispatcher.run_round()
-    return results(place.runs(job))
+    return list_results(place.runs(job))
 
 
-def results(runs: tuple[Run, ...]) -> list[dict[str, Any]]:
+def list_results(runs: tuple[Run, ...]) -> list[dict[str, Any]]:
     assert all(run.result is not None for run in runs)
     return [{**(run.result or {}), "seconds": 0} for run in runs]
 
 
-def told_on_joining(address: str, environment: dict[str, str]) -> str:
+def join_in_vain(address: str, environment: dict[str, str]) -> str:
     """What a process prints that tries to join; it must end by itself."""
     inherited = {name: text for name, text in os.environ.items() if not name.startswith("RAY_")}
     done = subprocess.run(
@@ -72,7 +72,7 @@ def test_two_nodes_give_the_bits_of_the_plain_loop_also_when_one_of_them_dies(
     place = Place(tmp_path / "data")
     with two_nodes(tmp_path) as cluster, ThreadPoolExecutor(1) as pool:
         # It takes 20 s: Ray tries again and again.
-        joining = pool.submit(told_on_joining, cluster.address, WRONG_TOKEN)
+        joining = pool.submit(join_in_vain, cluster.address, WRONG_TOKEN)
         for name, value in cluster.environment.items():
             monkeypatch.setenv(name, value)
         place.settings = place.settings.model_copy(
@@ -99,7 +99,7 @@ def test_two_nodes_give_the_bits_of_the_plain_loop_also_when_one_of_them_dies(
         0,
     )
     alone = place.submit(algorithm=ALGORITHM, sweep=SWEEP)
-    assert results(place.runs(shaken)) == plain(place, alone)
+    assert list_results(place.runs(shaken)) == plain(place, alone)
 
 
 def log_of(place: Place) -> str:

@@ -13,7 +13,7 @@ import pytest
 from service.formats.limits import DEFAULT_LIMITS, MIB
 from service.formats.recordings import read_with_notes
 from sysid.core.errors import UnreadableFile
-from tests.recorded_files import write_mat, write_parquet, write_sheet
+from tests.support.files.experiment_files import write_mat, write_parquet, write_sheet
 
 MEMORY = "MiB of memory"
 

@@ -17,19 +17,19 @@ from service.formats.sandbox import read_untrusted
 from sysid.core.child_processes import run_child
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
-from tests.limits import LIMIT_SECONDS
-from tests.mcap_files import foreign, json_messages, recorded
+from tests.support.files.mcap_files import json_messages, write_foreign_bytes, write_mcap_bytes
+from tests.support.limits import LIMIT_SECONDS
 
 TIMES = np.arange(200) * 0.01
 
 
-def saved(folder: Path, content: bytes) -> Path:
+def save_file(folder: Path, content: bytes) -> Path:
     path = folder / "upload"
     path.write_bytes(content)
     return path
 
 
-def refused(path: Path, **options: object) -> UnreadableFile:
+def read_refusal(path: Path, **options: object) -> UnreadableFile:
     with pytest.raises(UnreadableFile) as caught:
         read_untrusted(path, **options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
@@ -38,7 +38,7 @@ def refused(path: Path, **options: object) -> UnreadableFile:
 
 def test_a_csv_upload_is_read_with_its_notes_and_hash(tmp_path: Path) -> None:
     content = b"n,u [V]\n1,0.5\n1,\n2,0.25\n"
-    read = read_untrusted(saved(tmp_path, content), sample_time=0.5, segments=("n",))
+    read = read_untrusted(save_file(tmp_path, content), sample_time=0.5, segments=("n",))
     np.testing.assert_array_equal(read.recording.channel("u").values, [0.5, np.nan, 0.25])
     assert [one.labels["n"] for one in read.recording.segments] == [1.0, 2.0]
     assert any("missing" in note for note in read.notes)
@@ -47,7 +47,7 @@ def test_a_csv_upload_is_read_with_its_notes_and_hash(tmp_path: Path) -> None:
 
 def test_an_mcap_upload_comes_through_bit_for_bit(tmp_path: Path) -> None:
     before = Channel("u", TIMES, np.sin(TIMES), "V", "zero")
-    read = read_untrusted(saved(tmp_path, recorded(Recording((before,)))))
+    read = read_untrusted(save_file(tmp_path, write_mcap_bytes(Recording((before,)))))
     after = read.recording.channel("u")
     assert (after.unit, after.hold) == ("V", "zero")
     np.testing.assert_array_equal(after.values, before.values)
@@ -55,29 +55,29 @@ def test_an_mcap_upload_comes_through_bit_for_bit(tmp_path: Path) -> None:
 
 
 def test_the_place_of_a_fault_comes_out_of_the_child(tmp_path: Path) -> None:
-    error = refused(saved(tmp_path, b"t,u\n0,1\n1,x\n"))
+    error = read_refusal(save_file(tmp_path, b"t,u\n0,1\n1,x\n"))
     assert (error.row, error.column) == (3, "u")
-    content = recorded(Recording((Channel("u", TIMES, TIMES),)))
-    assert refused(saved(tmp_path, content[:-100])).byte is not None
+    content = write_mcap_bytes(Recording((Channel("u", TIMES, TIMES),)))
+    assert read_refusal(save_file(tmp_path, content[:-100])).byte is not None
 
 
 def test_missing_values_are_said_and_infinite_ones_refused(tmp_path: Path) -> None:
     messages = json_messages("/a", {"x": 1}, {"x": float("nan")})
-    read = read_untrusted(saved(tmp_path, foreign(messages)))
+    read = read_untrusted(save_file(tmp_path, write_foreign_bytes(messages)))
     assert any("'x': 1 of 2 values are missing" in note for note in read.notes)
-    infinite = foreign(json_messages("/a", {"x": 1}, {"x": float("inf")}))
-    assert "infinite at t = 0.1 s" in refused(saved(tmp_path, infinite)).detail
+    infinite = write_foreign_bytes(json_messages("/a", {"x": 1}, {"x": float("inf")}))
+    assert "infinite at t = 0.1 s" in read_refusal(save_file(tmp_path, infinite)).detail
 
 
 def test_a_file_larger_than_the_limit_is_refused(tmp_path: Path) -> None:
     limits = replace(DEFAULT_LIMITS, file_bytes=10)
-    assert "at most 10" in refused(saved(tmp_path, bytes(11)), limits=limits).detail
+    assert "at most 10" in read_refusal(save_file(tmp_path, bytes(11)), limits=limits).detail
 
 
 @pytest.mark.usefixtures("endless_children")
 def test_a_file_that_takes_too_long_is_refused(tmp_path: Path) -> None:
     limits = replace(DEFAULT_LIMITS, seconds=0.01)
-    assert "takes more than 0.01 s" in refused(saved(tmp_path, b""), limits=limits).detail
+    assert "takes more than 0.01 s" in read_refusal(save_file(tmp_path, b""), limits=limits).detail
 
 
 @pytest.mark.usefixtures("endless_children")
@@ -86,7 +86,7 @@ def test_a_file_that_burns_the_processor_is_stopped(
 ) -> None:
     limits = replace(DEFAULT_LIMITS, seconds=0.9)
     monkeypatch.setattr(sandbox, "run_child", run_for_long)  # its own limit ends it
-    error = refused(saved(tmp_path, b"t,u\n0,1\n"), limits=limits)
+    error = read_refusal(save_file(tmp_path, b"t,u\n0,1\n"), limits=limits)
     assert "takes more than 0.9 s" in error.detail
 
 
@@ -98,18 +98,18 @@ def run_for_long(module: str, task: bytes, *, seconds: float, folder: str) -> ob
 def test_a_file_that_needs_too_much_memory_is_refused(tmp_path: Path) -> None:
     rows = "".join(f"{k},{k}\n" for k in range(300_000))
     limits = replace(DEFAULT_LIMITS, memory_bytes=64 * MIB)
-    error = refused(saved(tmp_path, f"t,u\n{rows}".encode()), limits=limits)
+    error = read_refusal(save_file(tmp_path, f"t,u\n{rows}".encode()), limits=limits)
     assert "64 MiB of memory" in error.detail
 
 
 def test_a_file_that_makes_the_reader_stop_is_refused(tmp_path: Path) -> None:
     limits = replace(DEFAULT_LIMITS, total_bytes=0)  # the child may not write its answer's file
-    error = refused(saved(tmp_path, b"t,u\n0,1\n1,2\n"), limits=limits)
+    error = read_refusal(save_file(tmp_path, b"t,u\n0,1\n1,2\n"), limits=limits)
     assert "crashes its reader" in error.detail
 
 
 def test_times_that_no_file_can_hold_are_refused(tmp_path: Path) -> None:
-    assert "63 bits" in refused(saved(tmp_path, b"t,u\n-1e12,1\n0,2\n")).detail
+    assert "63 bits" in read_refusal(save_file(tmp_path, b"t,u\n-1e12,1\n0,2\n")).detail
 
 
 def test_identify_reads_mcap_under_the_limits_of_the_service(
@@ -117,7 +117,7 @@ def test_identify_reads_mcap_under_the_limits_of_the_service(
 ) -> None:
     times = np.arange(20_000) * 0.01
     path = tmp_path / "recording.mcap"
-    path.write_bytes(recorded(Recording((Channel("u", times, np.sin(times)),))))
+    path.write_bytes(write_mcap_bytes(Recording((Channel("u", times, np.sin(times)),))))
     own = FileOptions(None, ())
     np.testing.assert_array_equal(read_input_file(path, own).channel("u").values, np.sin(times))
     smaller = replace(DEFAULT_LIMITS, memory_bytes=64 * MIB)
@@ -135,7 +135,7 @@ def test_identify_reads_a_file_no_longer_than_the_service(
     monkeypatch.setattr(format_limits, "DEFAULT_LIMITS", short)
     with pytest.raises(typer.Exit):
         read_input_file(
-            saved(tmp_path, b"t,u\n0,1\n").rename(tmp_path / "a.mcap"), FileOptions(None, ())
+            save_file(tmp_path, b"t,u\n0,1\n").rename(tmp_path / "a.mcap"), FileOptions(None, ())
         )
     assert "takes more than 0.01 s" in capsys.readouterr().err
 
@@ -148,7 +148,7 @@ def test_the_reader_does_not_see_the_secrets_of_the_environment(
     program.chmod(0o700)
     monkeypatch.setattr(sys, "executable", str(program))
     monkeypatch.setenv("LAGID_API_KEY", "secret")
-    refused(saved(tmp_path, b"t,u\n0,1\n1,2\n"))
+    read_refusal(save_file(tmp_path, b"t,u\n0,1\n1,2\n"))
     names = {line.partition("=")[0] for line in (tmp_path / "seen").read_text().splitlines()}
     assert "PYTHONPATH" in names
     assert "LAGID_API_KEY" not in names

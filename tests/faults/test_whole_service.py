@@ -14,8 +14,8 @@ from benchmarks.breaking.stand import Stand, until
 from benchmarks.breaking.work import Stream
 from service.core.states import JobState
 from service.storage.tables import Checkpoint, Job, Run
-from tests.limits import LIMIT_SECONDS
-from tests.standing import Service
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.service.whole_service import Service
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(600)]
 
@@ -32,12 +32,12 @@ FAULTS = [
 
 
 @pytest.fixture(scope="module")
-def bench(standing: Service) -> Iterator[Bench]:
+def bench(whole_service: Service) -> Iterator[Bench]:
     """The service at work on jobs whose undisturbed results are known."""
-    stream = Stream(standing.stand, standing.folder, kinds=("sweep", "long"), size=0.3)
+    stream = Stream(whole_service.stand, whole_service.folder, kinds=("sweep", "long"), size=0.3)
     stream.measure("cancelled")
     stream.start()
-    yield Bench(standing.stand, stream, clock=standing.clock)
+    yield Bench(whole_service.stand, stream, clock=whole_service.clock)
     stream.finish()
 
 

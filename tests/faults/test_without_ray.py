@@ -9,8 +9,8 @@ import pytest
 
 from benchmarks.breaking.stand import until
 from service.core.states import JobState
-from tests.limits import LIMIT_SECONDS
-from tests.standing import ENDLESS, Service
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.service.whole_service import ENDLESS, Service
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(400)]
 

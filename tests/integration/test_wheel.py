@@ -17,10 +17,10 @@ from zipfile import ZipFile
 import pytest
 
 from service.client.embedded import find_free_port
-from tests.guard import SESSION_VARIABLE
-from tests.needs import report_missing
-from tests.repository import ROOT
-from tests.rest import recording
+from tests.support.checkout import ROOT
+from tests.support.requirements import report_missing
+from tests.support.service.web_app import recording
+from tests.support.session_guard import SESSION_VARIABLE
 
 pytestmark = pytest.mark.slow  # it builds a wheel
 

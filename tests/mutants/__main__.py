@@ -26,7 +26,7 @@ from typing import Literal
 
 from sysid.core.code_cache import find_cache_folder
 from tests.mutants.lists import Mutant, MutantList, check_lists, read_lists
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 LIMIT_SECONDS = 400.0
 COMPILED = ".compiled"

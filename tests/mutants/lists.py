@@ -9,7 +9,7 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 FOLDER = Path(__file__).parent
 

@@ -12,14 +12,14 @@ from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
-from tests.profiles import scale_examples
+from tests.support.profiles import scale_examples
 
 TIMES = 0.05 * np.arange(120.0)
 LAG = load_model("fopdt")
 BOUNDS = {"L": {"upper": 2.0}}
 
 
-def polynomial() -> Model:
+def build_polynomial() -> Model:
     """A recursion whose starts are sought by least squares, which counts too."""
     return parse_model(
         {
@@ -35,14 +35,14 @@ def polynomial() -> Model:
     )
 
 
-def record() -> Record:
+def make_record() -> Record:
     rng = np.random.default_rng(1)
     u = Channel("u", TIMES, np.repeat(rng.uniform(-1, 1, 12), 10), hold="zero")
     y = np.convolve(u.values, 0.1 * 0.9 ** np.arange(60))[: TIMES.size]
     return Record((u,), (Channel("y", TIMES, y + rng.normal(0, 0.01, TIMES.size)),))
 
 
-@pytest.mark.parametrize("model", [LAG, polynomial()], ids=["lag", "polynomial"])
+@pytest.mark.parametrize("model", [LAG, build_polynomial()], ids=["lag", "polynomial"])
 @settings(max_examples=scale_examples(25))
 @given(
     budget=st.integers(24, 900),
@@ -69,13 +69,13 @@ def test_a_budget_is_never_exceeded_or_refused_where_one_population_does(
             algorithm()
         assert caught.value.pointer == "/algorithm/stop/evaluations"
         return
-    found = identify(model, record(), algorithm(), parameters=BOUNDS if model is LAG else None)
+    found = identify(model, make_record(), algorithm(), parameters=BOUNDS if model is LAG else None)
     assert population <= found.evaluations <= budget
 
 
 def test_of_a_budget_that_leaves_none_for_standard_errors_it_is_said_why_there_are_none() -> None:
     algorithm = GeneticAlgorithm(stop=Stop(evaluations=50))
-    found = identify(LAG, record(), algorithm, parameters=BOUNDS)
+    found = identify(LAG, make_record(), algorithm, parameters=BOUNDS)
     assert found.evaluations <= 50
     assert all(one.stderr is None for one in found.parameters)
     assert all("the budget of simulations" in one.reason for one in found.parameters)

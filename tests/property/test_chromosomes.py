@@ -18,7 +18,7 @@ from sysid.search.operators import (
     sort_population,
 )
 from sysid.simulation.scaling import from_unit, to_unit
-from tests.searching import example
+from tests.support.library.search_problems import example
 
 BITS = st.integers(1, 32)
 WORD = st.integers(0, 2**32 - 1)

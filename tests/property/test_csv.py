@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from service.formats.csv_recordings import read_csv
 from sysid.core.errors import UnreadableFile
-from tests.profiles import scale_examples
+from tests.support.profiles import scale_examples
 
 VALUES = st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=30)
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from sysid.models.model import Model
 from sysid.simulation.problem import Problem
-from tests import reference
-from tests.models import difference, differential, individuals, record
-from tests.profiles import scale_examples
+from tests.support.library import plain_twins
+from tests.support.library.small_models import difference, differential, individuals, record
+from tests.support.profiles import scale_examples
 
 LAGGED = {
     "x": "v",
@@ -28,10 +28,10 @@ RECURSION = {
 
 def assert_equal(problem: Problem, one_step: bool = False) -> None:
     theta = individuals(problem, 4)
-    expected = np.array([reference.predictions(problem, one, one_step) for one in theta])
+    expected = np.array([plain_twins.predictions(problem, one, one_step) for one in theta])
     np.testing.assert_allclose(problem.predict(theta), expected, rtol=1e-9, atol=1e-11)
     if not one_step:
-        costs = [reference.fitness(problem, one) for one in theta]
+        costs = [plain_twins.fitness(problem, one) for one in theta]
         np.testing.assert_allclose(problem.evaluate_fitness(theta), costs, rtol=1e-9)
 
 

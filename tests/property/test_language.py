@@ -15,7 +15,7 @@ from sysid.language.monomials import collect_terms, to_expression
 from sysid.language.printer import format_expression
 from sysid.language.scope import Scope
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
-from tests.meaning import meaning
+from tests.support.library.expression_values import meaning
 
 SCOPE = Scope(
     "difference",

@@ -9,7 +9,7 @@ from sysid.data.records import Channel, Record
 from sysid.models.model import Model
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
-from tests.models import (
+from tests.support.library.small_models import (
     difference,
     differential,
     duffing,

@@ -15,7 +15,7 @@ from sysid.models.model import EstimatedInitial, Model, build_initial_parameters
 from sysid.models.parameters import Parameter
 from sysid.models.parse import parse_model
 from sysid.simulation.simulate import simulate
-from tests.catalogue_cases import CASES
+from tests.support.library.catalogue_cases import CASES
 
 FACTOR = 2.0
 
@@ -31,13 +31,13 @@ def all_free(model: Model) -> Model:
     return replace(model, parameters=tuple(free))
 
 
-def started_anywhere(model: Model) -> Model:
+def free_every_start(model: Model) -> Model:
     """The same, and every initial state is to be estimated too."""
     anywhere = (EstimatedInitial(-10.0, 10.0),) * len(model.states)
     return replace(all_free(model), initial=anywhere)
 
 
-def checked(
+def check_scalings(
     model: Model, values: dict[str, float], inputs: tuple[Channel, ...], times: FloatArray
 ) -> int:
     """Check every scaling of a model at some values; gives how many there are."""
@@ -72,7 +72,7 @@ def values_of(model: Model, name: str) -> dict[str, float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("freed", [as_it_is, all_free, started_anywhere])
+@pytest.mark.parametrize("freed", [as_it_is, all_free, free_every_start])
 def test_a_scaling_of_a_model_of_the_catalogue_leaves_its_outputs(
     name: str, freed: Callable[[Model], Model]
 ) -> None:
@@ -83,7 +83,7 @@ def test_a_scaling_of_a_model_of_the_catalogue_leaves_its_outputs(
         for one in model.inputs
         if case.signal is not None
     )
-    checked(model, values_of(model, name), inputs, times)
+    check_scalings(model, values_of(model, name), inputs, times)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_scalings_of_an_equation_of_a_hidden_state(equation: str, count: int) ->
     u = Channel("u", times, 1.5 + np.sin(times), "V", "first")
     truth = {"a": 0.7, "b": 1.3, "c": 0.4, "d": 1.1}
     values = {one: truth[one] for one in names} | {"z(0)": 0.5}
-    assert checked(model, values, (u,), times) == count
+    assert check_scalings(model, values, (u,), times) == count
 
 
 def test_a_fixed_exponent_hides_the_scaling_no_more_than_a_number_does() -> None:
@@ -145,6 +145,6 @@ def test_a_fixed_exponent_hides_the_scaling_no_more_than_a_number_does() -> None
     times: FloatArray = 0.05 * np.arange(60, dtype=np.float64)
     u = Channel("u", times, 1.5 + np.sin(times), "V", "first")
     values = {"a": 0.7, "b": 1.3, "d": 1.1, "n": 0.37, "z(0)": 0.5}
-    assert checked(model, values, (u,), times) == 1
+    assert check_scalings(model, values, (u,), times) == 1
     free = replace(model, parameters=tuple(replace(p, fixed=None) for p in model.parameters))
-    assert checked(free, values, (u,), times) == 0
+    assert check_scalings(free, values, (u,), times) == 0

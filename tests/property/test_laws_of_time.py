@@ -11,7 +11,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold
 from sysid.models.catalogue.load import load_model
 from sysid.simulation.simulate import simulate
-from tests.profiles import scale_examples
+from tests.support.profiles import scale_examples
 
 PERIOD, SAMPLES, QUIET = 0.05, 120, 40
 SYSTEMS: dict[str, dict[str, float]] = {

@@ -13,8 +13,8 @@ from service.formats import mcap_writer
 from service.formats.mcap import read_mcap
 from service.formats.topics import choose_clock
 from sysid.data.records import HOLDS, Channel, History, Recording
-from tests.mcap_files import recorded
-from tests.profiles import scale_examples
+from tests.support.files.mcap_files import write_mcap_bytes
+from tests.support.profiles import scale_examples
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=False)
 TIMES = st.one_of(
@@ -30,7 +30,7 @@ NAMES = st.lists(st.text(min_size=1, max_size=8), min_size=1, max_size=4, unique
 
 
 @st.composite
-def recordings(draw: st.DrawFn) -> Recording:
+def make_recordings(draw: st.DrawFn) -> Recording:
     bases = draw(st.lists(TIMES, min_size=1, max_size=2))
     channels = []
     for name in draw(NAMES):
@@ -43,11 +43,11 @@ def recordings(draw: st.DrawFn) -> Recording:
     return Recording(tuple(channels))
 
 
-@given(recordings(), st.integers(1, 40))
+@given(make_recordings(), st.integers(1, 40))
 @settings(max_examples=scale_examples(120))
 def test_names_times_and_values_come_back_bit_for_bit(recording: Recording, chunk: int) -> None:
     with mock.patch.object(mcap_writer, "CHUNK_SAMPLES", chunk):
-        content = recorded(recording)
+        content = write_mcap_bytes(recording)
     back = read_mcap(content)
     assert back.names == recording.names
     for before, after in zip(recording.channels, back.channels, strict=True):
@@ -60,10 +60,10 @@ def test_names_times_and_values_come_back_bit_for_bit(recording: Recording, chun
             np.testing.assert_array_equal(after.history.times, before.history.times)
 
 
-@given(recordings())
+@given(make_recordings())
 @settings(max_examples=scale_examples(25))
 def test_the_plain_reader_counts_the_same_samples(recording: Recording) -> None:
-    reader = make_reader(BytesIO(recorded(recording)), validate_crcs=True)
+    reader = make_reader(BytesIO(write_mcap_bytes(recording)), validate_crcs=True)
     counts: dict[str, int] = {}
     for _, channel, _ in reader.iter_messages():
         counts[channel.topic] = counts.get(channel.topic, 0) + 1

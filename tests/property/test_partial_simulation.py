@@ -14,8 +14,8 @@ from sysid.search.slopes import evaluate_partial_fitness
 from sysid.simulation.evaluator import predict_partially
 from sysid.simulation.problem import Problem, compute_record_progress
 from sysid.simulation.scaling import from_unit
-from tests.profiles import scale_examples
-from tests.searching import example, record
+from tests.support.library.search_problems import example, record
+from tests.support.profiles import scale_examples
 
 
 def irregular(n: int, seed: int) -> Record:
@@ -25,7 +25,7 @@ def irregular(n: int, seed: int) -> Record:
     return Record((held,), (Channel("y", times, np.sin(times)),))
 
 
-def problems() -> dict[str, Problem]:
+def build_problems() -> dict[str, Problem]:
     plant = load_model("fopdt")
     bounds = {"L": {"upper": 0.5}}
     short, long = example(n=60), np.zeros(140)
@@ -34,10 +34,10 @@ def problems() -> dict[str, Problem]:
     return {"two": two, "between": Problem.build(plant, between, parameters=bounds)}
 
 
-POSED = problems()
+POSED = build_problems()
 
 
-def candidates(problem: Problem, seed: int) -> FloatArray:
+def draw_candidates(problem: Problem, seed: int) -> FloatArray:
     places = np.random.default_rng(seed).random((5, len(problem.free_parameters)))
     return np.asarray(from_unit(problem.evaluator, places))
 
@@ -48,7 +48,7 @@ def test_a_part_of_the_simulation_is_the_beginning_of_the_whole(
     name: str, horizon: float, seed: int
 ) -> None:
     problem = POSED[name]
-    theta = candidates(problem, seed)
+    theta = draw_candidates(problem, seed)
     part = predict_partially(problem.evaluator, theta, horizon)[:, :5].T
     reached = compute_record_progress(problem) <= horizon
     whole = problem.predict(theta)[:, reached]
@@ -57,7 +57,7 @@ def test_a_part_of_the_simulation_is_the_beginning_of_the_whole(
 
 def test_a_part_reaches_a_sample_between_two_steps_at_its_end() -> None:
     problem = POSED["between"]
-    theta, progress = candidates(problem, 1), compute_record_progress(problem)
+    theta, progress = draw_candidates(problem, 1), compute_record_progress(problem)
     whole = problem.predict(theta)
     for m in range(0, progress.size, 4):
         part = predict_partially(problem.evaluator, theta, float(progress[m]))[:, :5].T
@@ -67,7 +67,7 @@ def test_a_part_reaches_a_sample_between_two_steps_at_its_end() -> None:
 @pytest.mark.parametrize("name", sorted(POSED))
 def test_fitness_by_the_whole_part_is_fitness(name: str) -> None:
     problem = POSED[name]
-    theta = candidates(problem, 3)
+    theta = draw_candidates(problem, 3)
     plan = make_plans(problem, GeneticAlgorithm(), 1)[0]
     predicted = predict_partially(problem.evaluator, theta, 1.0)
     found = evaluate_partial_fitness(problem.evaluator, plan, predicted, 1.0)[:5]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from service.formats.time_columns import parse_stamps
 from sysid.core.errors import UnreadableFile
-from tests.profiles import scale_examples
+from tests.support.profiles import scale_examples
 
 FORMS = (
     *("%Y-%m-%dT%H:%M:%S.%f", "%Y/%m/%d %H:%M:%S,%f", "%Y%m%dT%H%M%S.%f"),

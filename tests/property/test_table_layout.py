@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from service.formats.cells import classify_cell
 from service.formats.csv_recordings import read_csv
 from service.formats.table_layout import PEEK_ROWS, SEPARATORS
-from tests.profiles import scale_examples
+from tests.support.profiles import scale_examples
 
 NAMES = ("u", "y", "P1", "Druck", "flow rate", "x2", "T", "Ventil_1")
 UNITS = ("V", "degC", "bar", "%", "m/s", "l/min")
@@ -68,7 +68,7 @@ class Text:
 
 
 @st.composite
-def texts(draw: st.DrawFn) -> Text:
+def list_texts(draw: st.DrawFn) -> Text:
     width = draw(st.integers(1, 4))
     names = draw(st.permutations(NAMES))[:width]
     units = draw(st.lists(st.sampled_from(UNITS), min_size=width, max_size=width))
@@ -90,7 +90,7 @@ def texts(draw: st.DrawFn) -> Text:
     )
 
 
-@given(texts())
+@given(list_texts())
 @settings(max_examples=scale_examples(150))
 def test_numbers_names_and_units_come_back_from_any_layout(text: Text) -> None:
     content = text.write()

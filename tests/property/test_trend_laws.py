@@ -22,15 +22,15 @@ from sysid.trends.trend import (
     pool_estimates,
     predict_estimates,
 )
-from tests.profiles import draw_seeds, scale_examples
-from tests.rates import bound_count
+from tests.support.profiles import draw_seeds, scale_examples
+from tests.support.random_bounds import bound_count
 
 X = np.array([5.0, 10.0, 20.0, 40.0, 80.0])
 NUMBER = st.floats(-10, 10).filter(lambda v: v == 0 or abs(v) > 1e-3)
 SCALE = st.floats(1e-6, 1e6)
 
 
-def prediction(law: TrendLaw, x: np.ndarray, stderr: np.ndarray, at: float) -> TrendPoint:
+def make_prediction(law: TrendLaw, x: np.ndarray, stderr: np.ndarray, at: float) -> TrendPoint:
     return predict_estimates(law, x, stderr, np.array([at]))[0]
 
 
@@ -45,11 +45,11 @@ def drift_from_law(
     return compute_law_drifts([new], law, x, stderr, np.array([at]), comparisons)[0]
 
 
-def coefficients(law: TrendLaw) -> dict[str, tuple[float, float]]:
+def draw_coefficients(law: TrendLaw) -> dict[str, tuple[float, float]]:
     return {name: (value, error) for name, value, error in law.coefficients}
 
 
-def noisy(seed: int, n: int = 9) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def make_noisy(seed: int, n: int = 9) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     draw = np.random.default_rng(seed)
     x = np.sort(draw.uniform(1.0, 50.0, n))
     stderr = draw.uniform(0.5, 2.0, n)
@@ -62,7 +62,7 @@ def test_an_exact_line_is_recovered_and_chosen(a: float, b: float) -> None:
     found = fit_trend(X, a + b * X, np.full(5, 0.1), [30.0])
     assert found.best_law is not None
     assert found.best_law.kind == "line"
-    told = coefficients(found.best_law)
+    told = draw_coefficients(found.best_law)
     assert told["a"][0] == pytest.approx(a, abs=1e-12 * (abs(a) + 80 * abs(b)))
     assert told["b"][0] == pytest.approx(b, abs=1e-12 * (abs(a) + abs(b)))
     assert found.predictions[0].value == pytest.approx(a + 30 * b, abs=1e-11)
@@ -76,7 +76,7 @@ def test_an_exact_power_law_is_recovered_and_chosen(a: float, b: float) -> None:
     found = fit_trend(X, y, 0.01 * np.abs(y))
     assert found.best_law is not None
     assert found.best_law.kind == "power"
-    told = coefficients(found.best_law)
+    told = draw_coefficients(found.best_law)
     assert (told["a"][0], told["b"][0]) == (pytest.approx(a, rel=1e-7), pytest.approx(b, rel=1e-7))
 
 
@@ -85,7 +85,7 @@ def test_an_exact_power_law_is_recovered_and_chosen(a: float, b: float) -> None:
 def test_units_of_x_and_y_change_only_the_units_of_the_result(
     seed: int, metre: float, second: float
 ) -> None:
-    x, y, stderr = noisy(seed)
+    x, y, stderr = make_noisy(seed)
     found = fit_trend(x, y, stderr, [30.0])
     other = fit_trend(metre * x, second * y, second * stderr, [30.0 * metre])
     assert found.best_law is not None
@@ -100,17 +100,17 @@ def test_units_of_x_and_y_change_only_the_units_of_the_result(
 
 
 def test_the_line_and_its_covariance_are_those_of_the_textbook() -> None:
-    x, y, stderr = noisy(1)
+    x, y, stderr = make_noisy(1)
     law = fit_line(x, y, stderr)
     (b, a), covariance = np.polyfit(x, y, 1, w=1 / stderr, cov="unscaled")
-    told = coefficients(law)
+    told = draw_coefficients(law)
     assert (told["a"][0], told["b"][0]) == (pytest.approx(a), pytest.approx(b))
     assert told["b"][1] == pytest.approx(law.error_factor * covariance[0, 0] ** 0.5)
     assert told["a"][1] == pytest.approx(law.error_factor * covariance[1, 1] ** 0.5)
 
 
 def test_the_errors_of_a_power_law_are_those_of_its_slopes() -> None:
-    x, y, stderr = noisy(3)
+    x, y, stderr = make_noisy(3)
     law = fit_power(x, y, stderr)
     assert law is not None
     (_, a, a_error), (_, b, b_error) = law.coefficients
@@ -121,7 +121,7 @@ def test_the_errors_of_a_power_law_are_those_of_its_slopes() -> None:
 
 @pytest.mark.parametrize("seed", range(10))
 def test_no_neighbour_of_the_power_law_is_better(seed: int) -> None:
-    x, y, stderr = noisy(seed)
+    x, y, stderr = make_noisy(seed)
     law = fit_power(x, y, stderr)
     assert law is not None
     (_, a, da), (_, b, db) = law.coefficients
@@ -131,7 +131,7 @@ def test_no_neighbour_of_the_power_law_is_better(seed: int) -> None:
 
 
 def test_a_point_of_infinite_error_has_no_weight_and_a_doubled_point_counts_twice() -> None:
-    x, y, stderr = noisy(2)
+    x, y, stderr = make_noisy(2)
     wild = fit_line(np.append(x, 30.0), np.append(y, 1e3), np.append(stderr, 1e9))
     plain = fit_line(x, y, stderr)
     assert wild.evaluate_law(X) == pytest.approx(plain.evaluate_law(X), rel=1e-9)
@@ -151,7 +151,7 @@ def test_intervals_cover_what_they_say_even_where_errors_are_understated(
         draw = np.random.default_rng([5, seed])
         y = 0.3 * X + 1.0 + stderr * draw.normal(size=5)
         law = fit_line(X, y, stderr / understated)
-        told = prediction(law, X, stderr / understated, 30.0)
+        told = make_prediction(law, X, stderr / understated, 30.0)
         new = 0.3 * 30.0 + 1.0 + 0.02 * 30.0 * draw.normal()
         covered[0] += told.lower <= new <= told.upper
         error = (
@@ -168,7 +168,7 @@ def test_intervals_cover_what_they_say_even_where_errors_are_understated(
 
 
 def test_the_deleted_residual_is_that_of_a_fit_without_the_point() -> None:
-    x, y, stderr = noisy(7)
+    x, y, stderr = make_noisy(7)
     for i, one in enumerate(fit_trend_by_line(x, y, stderr)):
         others = fit_line(np.delete(x, i), np.delete(y, i), np.delete(stderr, i))
         at = x[i : i + 1]
@@ -295,7 +295,7 @@ def test_points_that_lie_on_a_law_by_luck_keep_its_stated_errors() -> None:
     )
     (_, _, a), (_, _, b) = lucky.coefficients
     assert [a, b] == pytest.approx((0.5 * np.sqrt(np.diag(covariance))).tolist())
-    told = prediction(lucky, X, stderr, 20.0)
+    told = make_prediction(lucky, X, stderr, 20.0)
     assert told.stderr == pytest.approx(float(np.hypot(lucky.evaluate_stderr(X[2:3])[0], 0.5)))
     assert told.upper - told.value == pytest.approx(stats.norm.ppf(0.975) * told.stderr)
 
@@ -306,7 +306,7 @@ def test_where_errors_are_understated_an_interval_is_that_of_student_and_of_the_
     assert law is not None
     assert law.birge_ratio > 5
     for at in (5.0, 30.0, 200.0):
-        told = prediction(law, X, stderr, at)
+        told = make_prediction(law, X, stderr, at)
         own = float(np.hypot(law.evaluate_stderr(np.array([at]))[0], 0.01))
         assert told.stderr == pytest.approx(law.birge_ratio * own)
         half = stats.t.ppf(0.975, 3) * told.stderr
@@ -369,7 +369,7 @@ def test_a_batch_without_change_rarely_drifts_from_its_own_law() -> None:
 
 def test_few_points_that_scatter_as_they_say_are_told_from_a_change_by_three_errors() -> None:
     exact = fit_line(X, 0.3 * X + 1.0, np.full(5, 0.1))
-    error = prediction(exact, X, np.full(5, 0.1), 30.0).stderr
+    error = make_prediction(exact, X, np.full(5, 0.1), 30.0).stderr
     for size, has_drifted in ((2.9, False), (3.1, True)):
         new = TrendEstimate(10.0 + size * error, 0.1)
         assert drift_from_law(new, exact, X, np.full(5, 0.1), 30.0).has_drifted is has_drifted
@@ -424,7 +424,7 @@ def test_aic_prefers_the_law_that_made_the_data() -> None:
 
 
 def test_aic_is_that_of_the_formula() -> None:
-    x, y, stderr = noisy(4)
+    x, y, stderr = make_noisy(4)
     law = fit_line(x, y, stderr)
     n = x.size
     assert law.aic == pytest.approx(n * log(law.chi_squared / n) + 6)
@@ -433,12 +433,12 @@ def test_aic_is_that_of_the_formula() -> None:
 
 @pytest.mark.parametrize("kind", ["line", "power"])
 def test_many_places_at_once_are_told_as_one_after_the_other(kind: str) -> None:
-    x, y, stderr = noisy(6, n=30)
+    x, y, stderr = make_noisy(6, n=30)
     law = fit_line(x, y, stderr) if kind == "line" else fit_power(x, y, stderr)
     assert law is not None
     at = np.array([-1.0, 0.0, 1e-3, 7.0, *x, 90.0])
     told = predict_estimates(law, x, stderr, at)
-    alone = [prediction(law, x, stderr, float(one)) for one in at]
+    alone = [make_prediction(law, x, stderr, float(one)) for one in at]
     np.testing.assert_allclose(np.array(told, float), np.array(alone, float), rtol=1e-12)
     new = [TrendEstimate(float(3.0 * one), 0.1) for one in at]
     found = compute_law_drifts(new, law, x, stderr, at, 4)
@@ -462,7 +462,7 @@ def test_the_error_of_a_new_estimate_lies_between_those_of_its_neighbours() -> N
 def test_looking_up_the_errors_of_a_batch_is_done_once_not_for_every_estimate(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    x, y, stderr = noisy(7, n=200)
+    x, y, stderr = make_noisy(7, n=200)
     law = fit_line(x, y, stderr)
     assert law is not None
     looked, unique = [], np.unique

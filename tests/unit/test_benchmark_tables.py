@@ -15,7 +15,7 @@ HOLDS, MISSES = Row("quick", 1.0, "s", 2.0), Row("slow", 3.0, "s", 2.0)
 SHOWN, SKIPPED = Row("shown", 9.0, "ms"), Skipped("peer", "not installed")
 
 
-def ended(rows, skipped, *options):
+def end_program(rows, skipped, *options):
     """The exit code of a program that found these figures."""
     try:
         report("Title", rows, skipped, parser("a program").parse_args(options))
@@ -29,13 +29,13 @@ def ended(rows, skipped, *options):
     [([HOLDS, SHOWN], [], 0), ([HOLDS, MISSES], [SKIPPED], 1), ([HOLDS], [SKIPPED], 2)],
 )
 def test_a_check_tells_misses_then_what_was_skipped(rows, skipped, code):
-    assert ended(rows, skipped, "--check") == code
-    assert ended(rows, skipped) == 0
+    assert end_program(rows, skipped, "--check") == code
+    assert end_program(rows, skipped) == 0
 
 
 def test_figures_with_bars_are_written_as_json_and_all_as_markdown(tmp_path):
     file = tmp_path / "one.json"
-    ended([SHOWN, MISSES], [SKIPPED], "--json", str(file))
+    end_program([SHOWN, MISSES], [SKIPPED], "--json", str(file))
     assert json.loads(file.read_text()) == [
         {"name": "slow", "value": 3.0, "unit": "s", "bar": 2.0, "relation": "<=", "holds": False}
     ]
@@ -44,7 +44,7 @@ def test_figures_with_bars_are_written_as_json_and_all_as_markdown(tmp_path):
 
 
 def test_the_table_of_all_names_each_program_and_those_that_wrote_nothing(tmp_path, monkeypatch):
-    ended([HOLDS], [], "--json", str(tmp_path / "one.json"))
+    end_program([HOLDS], [], "--json", str(tmp_path / "one.json"))
     monkeypatch.setattr(sys, "argv", ["collect", str(tmp_path), "one", "two"])
     assert collect.main() == 1
     text = (tmp_path / "bench.md").read_text()
@@ -62,7 +62,7 @@ def test_every_program_on_measured_records_is_part_of_all_of_them() -> None:
 
 def test_the_night_says_what_a_program_could_not_measure(tmp_path):
     file = tmp_path / "one.json"
-    ended(
+    end_program(
         [HOLDS], [Skipped("known vulnerabilities", "not reached: no answer")], "--json", str(file)
     )
     summary, misses = night.summarize(night.Part(["--json", str(file)]), tmp_path / "one.log")

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests import commands
+from tests.support.service import commands
 
 
 def read_state() -> dict[str, Any]:

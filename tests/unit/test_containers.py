@@ -11,7 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from service.api.queue_metrics import write_metrics
 from service.core.settings import Settings
 from service.storage.sessions import Database
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 DOCKER = ROOT / "docker"
 OURS = {"web", "dispatcher", "ray-head", "ray-worker"}

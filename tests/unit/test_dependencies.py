@@ -14,9 +14,9 @@ from packaging.requirements import Requirement
 
 from service.core import extras
 from service.core.errors import Misconfigured
-from tests.commands import check_refusal, run_lagid
-from tests.repository import ROOT
-from tests.sources import list_modules
+from tests.support.checkout import ROOT
+from tests.support.service.commands import check_refusal, run_lagid
+from tests.support.source_facts import list_modules
 
 PRODUCT = ("lagid", "sysid", "workers", "service", "migrations")
 # Modules that have another name than their distribution.

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.limits import LIMIT_SECONDS
-from tests.repository import ROOT
-from tests.sources import list_modules, read_facts
+from tests.support.checkout import ROOT
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.source_facts import list_modules, read_facts
 
 CODE = ("lagid", "sysid", "workers", "service", "migrations", "examples", "tests", "benchmarks")
 MACHINE = re.compile(
@@ -18,7 +18,7 @@ MACHINE = re.compile(
 )
 
 
-def _tracked() -> list[Path]:
+def _list_tracked() -> list[Path]:
     listing = subprocess.run(
         ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
     )
@@ -36,7 +36,7 @@ def test_the_top_level_has_nothing_but_the_house() -> None:
         "CITATION.cff",
     }
     others = {"benchmarks", "examples", ".ci", ".gitignore", ".dockerignore"}
-    entries = {path.relative_to(ROOT).parts[0] for path in _tracked()}
+    entries = {path.relative_to(ROOT).parts[0] for path in _list_tracked()}
     assert {one for one in entries if not one.endswith(".md")} <= folders | files | others
 
 
@@ -46,8 +46,8 @@ def test_the_formatter_has_no_exceptions() -> None:
     assert marked == []
 
 
-# A function says what it does: a verb first, no participle. Verbs in -eed are none. A property is a
-# value: it may be called by one and a noun (`scored_rows`), never by a participle alone.
+# A function says what it does: a verb first, no participle. Verbs in -eed are none. Properties and
+# fixtures are values: such may be called by one and a noun (`scored_rows`), never by one alone.
 PARTICIPLE = re.compile(
     r"^_*(?:told|kept|found|known|given|dealt|held|made|built|sent|[a-z]{2,}(?<!e)ed)(?:_|$)"
 )
@@ -57,9 +57,9 @@ READ_BY_USERS = (*PRODUCT, "examples")
 
 def test_no_function_is_named_by_a_participle() -> None:
     named = []
-    for path in list_modules(READ_BY_USERS):
+    for path in list_modules((*READ_BY_USERS, "tests")):
         facts = read_facts(path)
-        values = [line for line in facts.properties if "_" not in line.text.strip("_")]
+        values = [line for line in facts.values if "_" not in line.text.strip("_")]
         named += [
             f"{path.relative_to(ROOT)}:{line} {name}"
             for name, line in (*facts.functions, *values)
@@ -81,9 +81,10 @@ def test_two_waits_of_a_test_end_before_the_limit_of_pytest() -> None:
     assert limit >= 2 * LIMIT_SECONDS + 100.0
 
 
-def test_no_class_name_is_used_twice() -> None:
+@pytest.mark.parametrize("parts", [READ_BY_USERS, ("tests",)], ids=["product", "tests"])
+def test_no_class_name_is_used_twice(parts: tuple[str, ...]) -> None:
     places: dict[str, list[str]] = {}
-    for path in list_modules(READ_BY_USERS):
+    for path in list_modules(parts):
         for name, line in read_facts(path).classes:
             places.setdefault(name, []).append(f"{path.relative_to(ROOT)}:{line}")
     assert {name: found for name, found in places.items() if len(found) > 1} == {}
@@ -91,7 +92,7 @@ def test_no_class_name_is_used_twice() -> None:
 
 def test_nothing_names_a_registry_or_a_path_of_the_developers_machine() -> None:
     named = []
-    for path in _tracked():
+    for path in _list_tracked():
         try:
             text = path.read_text()
         except UnicodeDecodeError:

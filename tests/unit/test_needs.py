@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 TESTS = """
 import pytest
-pytest_plugins = ["tests.needs"]
+pytest_plugins = ["tests.support.requirements"]
 
 @pytest.mark.data
 def test_with_records(): pass

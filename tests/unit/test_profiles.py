@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
-from tests import profiles, rates
+from tests.support import profiles, random_bounds
 
 
 @pytest.mark.parametrize(("profile", "found"), [("gate", 40), ("dev", 100), ("night", 500)])
@@ -53,15 +53,15 @@ def test_what_is_marked_for_the_night_is_left_to_it(
 
 @pytest.mark.parametrize("draws", [20, 300])
 def test_a_count_is_as_rarely_out_of_bounds_as_a_false_alarm(draws: int) -> None:
-    least, most = rates.bound_count(draws, 0.9, 0.95)
-    alarm = rates.FALSE_ALARM / 2
+    least, most = random_bounds.bound_count(draws, 0.9, 0.95)
+    alarm = random_bounds.FALSE_ALARM / 2
     assert binom.cdf(least - 1, draws, 0.9) < alarm <= binom.cdf(least, draws, 0.9)
     assert binom.sf(most, draws, 0.95) <= alarm < binom.sf(most - 1, draws, 0.95)
 
 
 def test_a_mean_may_lie_further_away_the_fewer_and_the_wider_its_values() -> None:
     values = np.random.default_rng(0).normal(size=400)
-    wide = rates.bound_mean(values)
-    assert wide == pytest.approx(norm.isf(rates.FALSE_ALARM / 2) / 20, rel=0.1)
-    assert rates.bound_mean(3.0 * values, 0.5) == pytest.approx(3.0 * wide + 0.5)
-    assert rates.bound_mean(values[:100]) == pytest.approx(2.0 * wide, rel=0.2)
+    wide = random_bounds.bound_mean(values)
+    assert wide == pytest.approx(norm.isf(random_bounds.FALSE_ALARM / 2) / 20, rel=0.1)
+    assert random_bounds.bound_mean(3.0 * values, 0.5) == pytest.approx(3.0 * wide + 0.5)
+    assert random_bounds.bound_mean(values[:100]) == pytest.approx(2.0 * wide, rel=0.2)

@@ -4,8 +4,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.repository import ROOT
-from tests.sources import list_modules, read_facts
+from tests.support.checkout import ROOT
+from tests.support.source_facts import list_modules, read_facts
 
 MAX_WORDS, MEAN_WORDS = 25, 16
 MAX_WORDS_WITH_COLON = 30
@@ -17,7 +17,7 @@ DOCUMENTS = sorted(
 )
 
 
-def sentences(markdown: str, ends: str = ".!?:") -> list[str]:
+def split_sentences(markdown: str, ends: str = ".!?:") -> list[str]:
     """Sentences of prose: without code, tables and headings; an entry of a list is one."""
     prose = re.sub(r"```.*?```", "", markdown, flags=re.DOTALL)
     prose = re.sub(r"^\s*\|.*$|^#.*$", "", prose, flags=re.MULTILINE)
@@ -35,7 +35,9 @@ def sentences_of_cells(markdown: str) -> list[str]:
 
 def test_a_long_sentence_is_seen() -> None:
     long = " ".join(["word"] * 26) + "."
-    assert [len(one.split()) for one in sentences(f"# Title\n\nShort one here. {long}\n")] == [
+    assert [
+        len(one.split()) for one in split_sentences(f"# Title\n\nShort one here. {long}\n")
+    ] == [
         3,
         26,
     ]
@@ -50,9 +52,9 @@ def test_sentences_of_documents_are_short() -> None:
 def list_long_sentences(path: Path) -> Iterator[str]:
     """List sentences of a document that are too long, and the mean if that is."""
     text, name = path.read_text(), path.relative_to(ROOT)
-    short = sentences(text)
+    short = split_sentences(text)
     long = [one for one in (*sentences_of_cells(text), *short) if len(one.split()) > MAX_WORDS]
-    whole = sentences(text, ends=".!?")
+    whole = split_sentences(text, ends=".!?")
     long += [one for one in whole if len(one.split()) > MAX_WORDS_WITH_COLON]
     yield from (f"{name}: {one}" for one in long)
     if short and (mean := sum(len(one.split()) for one in short) / len(short)) > MEAN_WORDS:
@@ -71,7 +73,7 @@ def test_sentences_of_messages_are_short() -> None:
     assert long == []
 
 
-def comments(script: str) -> list[str]:
+def list_comments(script: str) -> list[str]:
     """Comments of a JavaScript file. Neighbouring lines that begin with ``//`` are one text."""
     blocks = [text.replace("*", " ") for text in re.findall(r"/\*(.*?)\*/", script, re.DOTALL)]
     lines = re.findall(r"((?:^[ \t]*// .*\n)+)", script, re.MULTILINE)
@@ -90,7 +92,7 @@ def visible_texts(template: str) -> list[str]:
 def test_a_long_sentence_of_a_page_is_seen() -> None:
     long = " ".join(["word"] * 26)
     script = f"const a = 1; // {long}\n  // one\n  // {long}\n/** {long}.\n * Short one here. */\n"
-    assert sorted(len(text.split()) for text in comments(script)) == [26, 27, 29]
+    assert sorted(len(text.split()) for text in list_comments(script)) == [26, 27, 29]
     page = f'<p>a <b>{long}</b></p>{{# {long} #}}<i title="{long} b">{{{{ x }}}}{{% if x %}} a'
     assert sorted(len(text.split()) for text in visible_texts(page) if text) == [1, 1, 27, 27]
 
@@ -98,7 +100,7 @@ def test_a_long_sentence_of_a_page_is_seen() -> None:
 def test_sentences_of_pages_are_short() -> None:
     pages = ROOT / "service" / "pages"
     texts = [
-        *((path, text) for path in pages.rglob("*.js") for text in comments(path.read_text())),
+        *((path, text) for path in pages.rglob("*.js") for text in list_comments(path.read_text())),
         *(
             (path, text)
             for path in pages.rglob("*.html")

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.database import KINDS
-from tests.guarded import Guarded, guard
+from tests.support.service.keyed_service import Guarded, guard
+from tests.support.storage.databases import KINDS
 
 
 @pytest.fixture(params=KINDS, scope="module")
-def guarded(
+def keyed_service(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Guarded]:
     """The service for the tests of a module."""

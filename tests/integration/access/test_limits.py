@@ -21,14 +21,14 @@ from service.storage.columns import utc_now
 from service.storage.errors import RowConflict, RowNotFound
 from service.storage.sessions import Database, SessionOwner, find_project
 from service.storage.tables import Job
-from tests.database import record_statements
-from tests.stored import claim, job_of, new_dataset, new_job, state_of, submit
+from tests.support.storage.databases import record_statements
+from tests.support.storage.job_rows import claim, job_of, new_dataset, new_job, state_of, submit
 
 SETTINGS = Settings()
 
 
 @pytest.fixture
-def limited(database: Database) -> Database:
+def limited_database(database: Database) -> Database:
     """The database for a project that may store 25 bytes and make 100 evaluations a day."""
     limits = {"max_stored_bytes": 25, "max_daily_evaluations": 100, "max_open_jobs": 3}
     with database.write_session() as session:
@@ -60,25 +60,27 @@ def end_job(database: Database, evaluations: int, hours_ago: float, **values: ob
     add_job(database, **ended, **values)
 
 
-def test_stored_bytes_are_limited_and_a_deletion_makes_room(limited: Database) -> None:
-    first = add_dataset(limited, "a")
-    add_dataset(limited, "b")
+def test_stored_bytes_are_limited_and_a_deletion_makes_room(limited_database: Database) -> None:
+    first = add_dataset(limited_database, "a")
+    add_dataset(limited_database, "b")
     with pytest.raises(BudgetExceeded, match="would store 30 bytes; at most 25") as error:
-        add_dataset(limited, "c")
+        add_dataset(limited_database, "c")
     assert error.value.headers == {"Retry-After": "3600"}
-    assert add_dataset(limited, "a") == first  # what is there already needs no room
-    with limited.write_session() as session:
+    assert add_dataset(limited_database, "a") == first  # what is there already needs no room
+    with limited_database.write_session() as session:
         DatasetRepository(session).delete(first)
-    add_dataset(limited, "c")
+    add_dataset(limited_database, "c")
 
 
-def test_bytes_that_are_stored_at_once_do_not_pass_the_limit_together(limited: Database) -> None:
+def test_bytes_that_are_stored_at_once_do_not_pass_the_limit_together(
+    limited_database: Database,
+) -> None:
     start = Barrier(6)
 
     def store(number: int) -> bool:
         start.wait()
         try:
-            add_dataset(limited, f"s{number}")
+            add_dataset(limited_database, f"s{number}")
         except BudgetExceeded:
             return False
         return True
@@ -88,19 +90,19 @@ def test_bytes_that_are_stored_at_once_do_not_pass_the_limit_together(limited: D
 
 
 def test_evaluations_of_a_day_are_limited_until_the_first_job_is_a_day_old(
-    limited: Database,
+    limited_database: Database,
 ) -> None:
-    end_job(limited, 1000, hours_ago=25)
-    end_job(limited, 60, hours_ago=23)
-    end_job(limited, 30, hours_ago=1)
-    end_job(limited, 1000, hours_ago=1, n_runs=4, n_reused=4)  # computed by other jobs
-    add_job(limited, evaluations=20)
+    end_job(limited_database, 1000, hours_ago=25)
+    end_job(limited_database, 60, hours_ago=23)
+    end_job(limited_database, 30, hours_ago=1)
+    end_job(limited_database, 1000, hours_ago=1, n_runs=4, n_reused=4)  # computed by other jobs
+    add_job(limited_database, evaluations=20)
     with pytest.raises(BudgetExceeded, match="made 110 evaluations; 100 are allowed") as error:
-        add_job(limited)
+        add_job(limited_database)
     assert 3500 < int(error.value.headers["Retry-After"]) <= 3600
-    with limited.write_session() as session:
+    with limited_database.write_session() as session:
         ProjectRepository(session).change_limits("limited", {"max_daily_evaluations": 111})
-    add_job(limited)
+    add_job(limited_database)
 
 
 def start_job(database: Database, evaluations: int) -> Lease:
@@ -114,72 +116,72 @@ def start_job(database: Database, evaluations: int) -> Lease:
 
 
 def test_jobs_that_use_up_the_day_are_stopped_and_go_on_a_day_later(
-    limited: Database, caplog: pytest.LogCaptureFixture
+    limited_database: Database, caplog: pytest.LogCaptureFixture
 ) -> None:
-    held = start_job(limited, 99)
-    queued = submit(limited)
-    assert stop_overruns(limited) == []
-    with limited.write_session() as session:
+    held = start_job(limited_database, 99)
+    queued = submit(limited_database)
+    assert stop_overruns(limited_database) == []
+    with limited_database.write_session() as session:
         LeaseQueue(session).write_progress(held, JobProgress(101))
-    others = submit(limited.open_for(SessionOwner()))
-    assert stop_overruns(limited) == [held.job_id, queued]
-    assert stop_overruns(limited) == []  # the dispatcher is asked once
+    others = submit(limited_database.open_for(SessionOwner()))
+    assert stop_overruns(limited_database) == [held.job_id, queued]
+    assert stop_overruns(limited_database) == []  # the dispatcher is asked once
     assert "made 101 evaluations; 100 are allowed" in caplog.text
-    with limited.write_session() as session:
+    with limited_database.write_session() as session:
         LeaseQueue(session).cancel_parcel(held)
     for job_id in (held.job_id, queued):
-        job = job_of(limited, job_id)
+        job = job_of(limited_database, job_id)
         assert job.state is JobState.CANCELLED
         assert "101 evaluations; 100 are allowed. Resume the job" in str(job.error)
-    assert state_of(limited.open_for(SessionOwner()), others) is JobState.QUEUED
-    with limited.read_session() as session:
+    assert state_of(limited_database.open_for(SessionOwner()), others) is JobState.QUEUED
+    with limited_database.read_session() as session:
         (entry,) = list_actions(session, find_project(session), limit=1).items
         assert (entry.action, entry.actor, entry.object_id) == ("job.cancel", "daily limit", queued)
-    with pytest.raises(BudgetExceeded), limited.write_session() as session:
+    with pytest.raises(BudgetExceeded), limited_database.write_session() as session:
         resume_job(session, held.job_id, SETTINGS)
-    with limited.write_session() as session:
+    with limited_database.write_session() as session:
         for job_id in (held.job_id, queued):
             session.get_one(Job, job_id).finished_at = utc_now() - timedelta(hours=25)
-    with limited.write_session() as session:
+    with limited_database.write_session() as session:
         job = resume_job(session, held.job_id, SETTINGS)
         assert (job.error, job.evaluations) == (None, 101)
-    assert stop_overruns(limited) == []  # what it made a day before counts no more
-    again = claim(limited)
+    assert stop_overruns(limited_database) == []  # what it made a day before counts no more
+    again = claim(limited_database)
     assert again is not None
-    with limited.write_session() as session:
+    with limited_database.write_session() as session:
         LeaseQueue(session).write_progress(again.lease, JobProgress(201))
-    assert stop_overruns(limited) == [held.job_id]
+    assert stop_overruns(limited_database) == [held.job_id]
 
 
-def test_a_job_that_ends_before_it_is_stopped_ends_as_it_would(limited: Database) -> None:
-    held = start_job(limited, 100)
-    assert stop_overruns(limited) == [held.job_id]
-    with limited.write_session() as session:
+def test_a_job_that_ends_before_it_is_stopped_ends_as_it_would(limited_database: Database) -> None:
+    held = start_job(limited_database, 100)
+    assert stop_overruns(limited_database) == [held.job_id]
+    with limited_database.write_session() as session:
         LeaseQueue(session).finish_job(held, JobState.FAILED, "no result")
-    assert job_of(limited, held.job_id).error == "no result"
+    assert job_of(limited_database, held.job_id).error == "no result"
 
 
-def test_a_heartbeat_of_a_dispatcher_stops_what_goes_too_far(limited: Database) -> None:
-    held = start_job(limited, 100)
-    HeldLeases(limited, 10.0).renew_leases()
-    assert job_of(limited, held.job_id).cancel_requested
+def test_a_heartbeat_of_a_dispatcher_stops_what_goes_too_far(limited_database: Database) -> None:
+    held = start_job(limited_database, 100)
+    HeldLeases(limited_database, 10.0).renew_leases()
+    assert job_of(limited_database, held.job_id).cancel_requested
 
 
-def test_a_project_has_its_own_limit_of_open_jobs(limited: Database) -> None:
+def test_a_project_has_its_own_limit_of_open_jobs(limited_database: Database) -> None:
     for _ in range(3):
-        add_job(limited)
+        add_job(limited_database)
     with pytest.raises(QuotaExceeded, match="3 jobs of the project are queued or running"):
-        add_job(limited)
-    with limited.write_session() as session:
+        add_job(limited_database)
+    with limited_database.write_session() as session:
         ProjectRepository(session).change_limits("limited", {"max_open_jobs": None})
-    add_job(limited)
+    add_job(limited_database)
 
 
-def test_what_a_project_uses_is_measured(limited: Database) -> None:
-    add_dataset(limited, "a")
-    end_job(limited, 60, hours_ago=1)
-    add_job(limited, evaluations=20)
-    with limited.read_session() as session:
+def test_what_a_project_uses_is_measured(limited_database: Database) -> None:
+    add_dataset(limited_database, "a")
+    end_job(limited_database, 60, hours_ago=1)
+    add_job(limited_database, evaluations=20)
+    with limited_database.read_session() as session:
         repository = ProjectRepository(session)
         used = repository.measure_use(repository.get("limited").id)
         others = repository.measure_use("proj_default")
@@ -194,8 +196,10 @@ def test_without_a_limit_nothing_is_counted(database: Database) -> None:
     assert not [text for text, _ in statements if "sum(datasets" in text or "evaluations *" in text]
 
 
-def test_a_project_is_found_by_name_or_identifier_and_names_are_unique(limited: Database) -> None:
-    with limited.write_session() as session:
+def test_a_project_is_found_by_name_or_identifier_and_names_are_unique(
+    limited_database: Database,
+) -> None:
+    with limited_database.write_session() as session:
         repository = ProjectRepository(session)
         project = repository.get("limited")
         assert repository.get(project.id) is project

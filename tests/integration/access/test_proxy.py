@@ -9,8 +9,8 @@ from starlette.testclient import TestClient
 
 from service.api.access_check import COOKIE
 from service.api.app import create_app
-from tests.guarded import Guarded, guard
-from tests.rest import refused, settings_of
+from tests.support.service.keyed_service import Guarded, guard
+from tests.support.service.web_app import read_faults, settings_of
 
 PROXY = {"auth": "proxy", "proxy_header": "X-User", "proxy_admins": "Ada@lab"}
 
@@ -29,7 +29,7 @@ def test_a_user_of_the_proxy_may_write_and_only_named_ones_may_manage(behind: Gu
     assert (user["actor"], user["scopes"]) == ("user:grace", ["read", "write"])
     admin = behind.ask("GET", "/v1/access", headers={"X-User": "ada@lab"}).json()
     assert admin["scopes"] == ["read", "write", "admin"]
-    refused(behind.ask("GET", "/v1/audit", headers={"X-User": "grace"}), 403, "out-of-scope")
+    read_faults(behind.ask("GET", "/v1/audit", headers={"X-User": "grace"}), 403, "out-of-scope")
     model = {"name": "tank", "form": "differential"}
     assert behind.ask("POST", "/v1/models:check", json=model, headers={"X-User": "a"}).is_success
 
@@ -39,7 +39,7 @@ def test_credentials_that_a_proxy_passes_on_are_its_own(behind: Guarded) -> None
         headers = {"X-User": "grace", "Authorization": passed_on}
         user = behind.ask("GET", "/v1/access", headers=headers).json()
         assert user["actor"] == "user:grace"
-        refused(
+        read_faults(
             behind.ask("GET", "/v1/access", headers={"Authorization": passed_on}),
             401,
             "unauthorized",
@@ -49,11 +49,11 @@ def test_credentials_that_a_proxy_passes_on_are_its_own(behind: Guarded) -> None
 def test_without_one_user_the_proxy_or_a_key_is_needed(behind: Guarded) -> None:
     for names in ([], [""], ["a\tb"], ["a" * 101], ["grace", "ada@lab"]):
         headers = [("X-User", name) for name in names]
-        refused(behind.client.get("/v1/jobs", headers=headers), 401, "unauthorized")
+        read_faults(behind.client.get("/v1/jobs", headers=headers), 401, "unauthorized")
     token = behind.add_key(scope="read")
     assert behind.ask("GET", "/v1/jobs", token).status_code == 200
     wrong = behind.ask("GET", "/v1/jobs", "lagid_1_2", headers={"X-User": "ada@lab"})
-    refused(wrong, 401, "unauthorized")
+    read_faults(wrong, 401, "unauthorized")
     signed_in = behind.ask("POST", "/sign-in", data={"key": token})
     behind.client.cookies.clear()
     cookie = {"Cookie": f"{COOKIE}={signed_in.cookies[COOKIE]}"}
@@ -65,13 +65,13 @@ def test_an_address_that_is_no_proxy_names_nobody(tmp_path: Path) -> None:
         for address in ("10.2.0.1", "127.0.0.1", "testclient"):
             guarded.client._transport.client = (address, 1)  # type: ignore[attr-defined]
             headers = {"X-User": "ada@lab", "X-Forwarded-For": "10.1.2.3"}
-            refused(guarded.ask("GET", "/v1/jobs", headers=headers), 401, "unauthorized")
+            read_faults(guarded.ask("GET", "/v1/jobs", headers=headers), 401, "unauthorized")
 
 
 def test_without_the_mode_the_header_means_nothing(tmp_path: Path) -> None:
     with guard("sqlite", tmp_path, proxy_header="X-User", proxy_addresses="127.0.0.1") as guarded:
         guarded.client._transport.client = ("127.0.0.1", 1)  # type: ignore[attr-defined]
-        refused(guarded.ask("GET", "/v1/jobs", headers={"X-User": "ada"}), 401, "unauthorized")
+        read_faults(guarded.ask("GET", "/v1/jobs", headers={"X-User": "ada"}), 401, "unauthorized")
 
 
 @pytest.mark.parametrize(("address", "secure"), [("127.0.0.1", True), ("10.9.9.9", False)])

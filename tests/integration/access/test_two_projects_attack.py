@@ -19,9 +19,9 @@ from service.repositories.audit import list_actions
 from service.storage.tables import DEFAULT_PROJECT, ApiKey, AuditEntry, Base, Project
 from sysid.models.catalogue.load import copy_catalogue_document
 from sysid.results.figures import FigureName
-from tests.guarded import Guarded
-from tests.identified import identified
-from tests.rest import CSV, recording, store_csv_in
+from tests.support.service.keyed_service import Guarded
+from tests.support.service.local_runs import identify_job
+from tests.support.service.web_app import CSV, recording, store_csv_in
 
 FAST = {"population": 20, "generations": 15, "islands": 1, "refine": False}
 JSON = {"content-type": "application/json"}
@@ -56,16 +56,16 @@ class Side:
 
 
 @pytest.fixture(scope="module")
-def sides(guarded: Guarded) -> tuple[Side, Side]:
+def sides(keyed_service: Guarded) -> tuple[Side, Side]:
     """The default project, and another one."""
     return (
-        _fill(guarded, DEFAULT_PROJECT, "alphamark"),
-        _fill(guarded, guarded.add_project("other"), "betamark"),
+        _fill(keyed_service, DEFAULT_PROJECT, "alphamark"),
+        _fill(keyed_service, keyed_service.add_project("other"), "betamark"),
     )
 
 
-def _fill(guarded: Guarded, project: str, mark: str) -> Side:
-    parts, key = guarded.parts_for(project), guarded.add_key(project)
+def _fill(keyed_service: Guarded, project: str, mark: str) -> Side:
+    parts, key = keyed_service.parts_for(project), keyed_service.add_key(project)
     dataset = store_csv_in(parts, recording(), f"steps {mark}")
     store_csv_in(parts, recording(n=100), "own")
     document = {**copy_catalogue_document("fopdt"), "name": f"lag-{project[-6:].replace('_', '-')}"}
@@ -79,7 +79,7 @@ def _fill(guarded: Guarded, project: str, mark: str) -> Side:
         "algorithm": FAST,
         "sweep": {"axes": [{"path": "/seed", "values": [1, 2]}]},
     }
-    job, runs = identified(parts, body)
+    job, runs = identify_job(parts, body)
     reference = f"accepted-{project[-6:]}"
     with parts.database.write_session() as session:
         accept_reference(session, reference, ReferenceIn(run=runs[0], note=mark))
@@ -89,8 +89,8 @@ def _fill(guarded: Guarded, project: str, mark: str) -> Side:
     return Side(project, key, mark, {**ids, "name": [model, reference], "kind": ["quota"]})
 
 
-def _list_routes(guarded: Guarded) -> list[tuple[str, APIRoute]]:
-    entries: list[Any] = list(guarded.client.app.routes)  # type: ignore[attr-defined]
+def _list_routes(keyed_service: Guarded) -> list[tuple[str, APIRoute]]:
+    entries: list[Any] = list(keyed_service.client.app.routes)  # type: ignore[attr-defined]
     found = []
     while entries:
         entry = entries.pop()
@@ -157,8 +157,10 @@ def _list_bodies(method: str, path: str, victim: Side) -> list[dict[str, Any]]:
     return [{"content": json.dumps(body), "headers": JSON} for body in bodies.get(path, [])]
 
 
-def _list_requests(guarded: Guarded, victim: Side) -> Iterator[tuple[str, APIRoute, str, Any]]:
-    for method, route in _list_routes(guarded):
+def _list_requests(
+    keyed_service: Guarded, victim: Side
+) -> Iterator[tuple[str, APIRoute, str, Any]]:
+    for method, route in _list_routes(keyed_service):
         is_reading = method in ("GET", "HEAD", "OPTIONS")
         arguments = [{}] if is_reading else _list_bodies(method, route.path, victim)
         if route.body_field is not None or "requestBody" in (route.openapi_extra or {}):
@@ -174,21 +176,21 @@ def _list_requests(guarded: Guarded, victim: Side) -> Iterator[tuple[str, APIRou
                 yield method, route, path + query, one
 
 
-def test_the_walk_reaches_every_route_of_the_document(guarded: Guarded) -> None:
-    walked = {route.path.replace(":path}", "}") for _, route in _list_routes(guarded)}
-    assert walked >= set(guarded.client.app.openapi()["paths"])  # type: ignore[attr-defined]
+def test_the_walk_reaches_every_route_of_the_document(keyed_service: Guarded) -> None:
+    walked = {route.path.replace(":path}", "}") for _, route in _list_routes(keyed_service)}
+    assert walked >= set(keyed_service.client.app.openapi()["paths"])  # type: ignore[attr-defined]
     assert {"/", "/keys", "/jobs/{job_id}", "/pages/models/{name}.yaml"} <= walked
 
 
 @pytest.mark.parametrize("direction", [0, 1], ids=["other on default", "default on other"])
 def test_a_project_sees_and_changes_nothing_of_another(
-    guarded: Guarded, sides: tuple[Side, Side], direction: int
+    keyed_service: Guarded, sides: tuple[Side, Side], direction: int
 ) -> None:
     victim, attacker = sides[direction], sides[1 - direction]
-    before = _read_rows(guarded, victim.project)
+    before = _read_rows(keyed_service, victim.project)
     seen = []
-    for method, route, path, arguments in _list_requests(guarded, victim):
-        answer = guarded.ask(method, path, attacker.key, **dict(arguments))
+    for method, route, path, arguments in _list_requests(keyed_service, victim):
+        answer = keyed_service.ask(method, path, attacker.key, **dict(arguments))
         told = (method, path, arguments, answer.status_code, answer.text[:300])
         sent = path + str(arguments.get("content", ""))
         if victim.mark not in sent:
@@ -201,26 +203,26 @@ def test_a_project_sees_and_changes_nothing_of_another(
             assert answer.is_error, told
         assert answer.status_code < 500 or path == "/readyz", told
         seen.append(answer.status_code)
-    assert _read_rows(guarded, victim.project) == before
+    assert _read_rows(keyed_service, victim.project) == before
     assert seen.count(404) > 40
 
 
 def test_the_same_requests_are_answered_to_who_owns_what_they_name(
-    guarded: Guarded, sides: tuple[Side, Side]
+    keyed_service: Guarded, sides: tuple[Side, Side]
 ) -> None:
     """Else the attack would be refused for another reason."""
     side = sides[1]
     marked, done, recorded = 0, set(), set()
-    for method, route, path, arguments in _list_requests(guarded, side):
+    for method, route, path, arguments in _list_requests(keyed_service, side):
         if "content" in arguments:
-            before = _count_actions(guarded, side)
-            answer = guarded.ask(method, path, side.key, **dict(arguments))
+            before = _count_actions(keyed_service, side)
+            answer = keyed_service.ask(method, path, side.key, **dict(arguments))
             assert answer.is_success or "name" in route.path, (method, path, arguments, answer.text)
             if find_needed_scope(method, path) != "read":
                 done.add(route.path)
-                recorded |= {route.path} if _count_actions(guarded, side) > before else set()
+                recorded |= {route.path} if _count_actions(keyed_service, side) > before else set()
         if method in ("GET", "HEAD") and any(f"{{{name}}}" in route.path for name in IDS):
-            answer = guarded.ask(method, path, side.key, **dict(arguments))
+            answer = keyed_service.ask(method, path, side.key, **dict(arguments))
             allowed = (200, 204, 404) if "figures" in path else (200, 204)
             allowed = (*allowed, 409, 422) if "trend" in path else allowed
             assert answer.status_code in allowed, (method, path, answer.text[:300])
@@ -229,16 +231,18 @@ def test_the_same_requests_are_answered_to_who_owns_what_they_name(
     assert done == recorded  # each kind of change is in the audit log
     assert len(done) > 7
     for path in ("/v1/jobs", "/v1/datasets", "/v1/models", "/", "/datasets"):
-        assert side.mark in guarded.ask("GET", path, side.key).text
+        assert side.mark in keyed_service.ask("GET", path, side.key).text
 
 
 def test_equal_bytes_keys_and_runs_of_two_projects_stay_apart(
-    guarded: Guarded, sides: tuple[Side, Side]
+    keyed_service: Guarded, sides: tuple[Side, Side]
 ) -> None:
     content = recording(n=50)
     names = ("first", "second")
     stored = [
-        guarded.ask("POST", f"/v1/datasets?name={name}", side.key, content=content, headers=CSV)
+        keyed_service.ask(
+            "POST", f"/v1/datasets?name={name}", side.key, content=content, headers=CSV
+        )
         for side, name in zip(sides, names, strict=True)
     ]
     assert [answer.status_code for answer in stored] == [201, 201]
@@ -246,7 +250,7 @@ def test_equal_bytes_keys_and_runs_of_two_projects_stay_apart(
     assert stored[0].json()["sha256"] != ""
     assert stored[0].json()["id"] != stored[1].json()["id"]
     jobs = [
-        guarded.ask(
+        keyed_service.ask(
             "POST",
             "/v1/jobs",
             side.key,
@@ -259,20 +263,20 @@ def test_equal_bytes_keys_and_runs_of_two_projects_stay_apart(
     assert jobs[0].json()["id"] != jobs[1].json()["id"]
     # Both sides submitted the same computation: neither took the other's result.
     for side in sides:
-        result = guarded.ask("GET", f"/v1/runs/{side.run}", side.key).json()
+        result = keyed_service.ask("GET", f"/v1/runs/{side.run}", side.key).json()
         assert "reused_from" not in result or result["reused_from"] is None
 
 
-def _count_actions(guarded: Guarded, side: Side) -> int:
-    with guarded.parts.database.read_session() as session:
+def _count_actions(keyed_service: Guarded, side: Side) -> int:
+    with keyed_service.parts.database.read_session() as session:
         return len(list_actions(session, side.project, limit=1000).items)
 
 
-def _read_rows(guarded: Guarded, project: str) -> dict[str, list[Any]]:
+def _read_rows(keyed_service: Guarded, project: str) -> dict[str, list[Any]]:
     """All rows that name the project, and those that belong to rows of it alone."""
     rows: dict[str, list[Any]] = {}
     skipped = (Project, ApiKey, AuditEntry)
-    with guarded.parts.database.engine.connect() as connection:
+    with keyed_service.parts.database.engine.connect() as connection:
         for table in Base.metadata.sorted_tables:
             if table.name in {kind.__tablename__ for kind in skipped}:
                 continue

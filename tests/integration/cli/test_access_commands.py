@@ -8,9 +8,9 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
-from tests.commands import check_refusal, run_lagid
-from tests.rest import recording, settings_of
-from tests.serving import serve_in_thread
+from tests.support.service.commands import check_refusal, run_lagid
+from tests.support.service.web_app import recording, settings_of
+from tests.support.service.web_server import serve_in_thread
 
 
 @pytest.fixture

@@ -7,9 +7,9 @@ from pathlib import Path
 from service.api.app import create_app
 from service.client.client import Client
 from service.core.folder_lock import lock_folder
-from tests.commands import CommandResult, check_refusal, run_lagid
-from tests.rest import recording, settings_of
-from tests.serving import serve_in_thread
+from tests.support.service.commands import CommandResult, check_refusal, run_lagid
+from tests.support.service.web_app import recording, settings_of
+from tests.support.service.web_server import serve_in_thread
 
 
 def run(folder: Path, *words: str) -> CommandResult:

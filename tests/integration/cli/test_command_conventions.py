@@ -14,11 +14,11 @@ import pytest
 import lagid
 from service.api.app import create_app
 from service.client.client import Client
-from tests.commands import CommandResult, check_refusal, run_lagid
-from tests.identified import identified
-from tests.repository import ROOT
-from tests.rest import recording, settings_of
-from tests.serving import serve_in_thread
+from tests.support.checkout import ROOT
+from tests.support.service.commands import CommandResult, check_refusal, run_lagid
+from tests.support.service.local_runs import identify_job
+from tests.support.service.web_app import recording, settings_of
+from tests.support.service.web_server import serve_in_thread
 
 pytestmark = pytest.mark.slow  # some identify
 
@@ -36,20 +36,20 @@ FAST = {"population": 20, "generations": 20, "islands": 1}
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
+def server_job(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
     """A server with a recording `steps` and one finished job: its address, and the job."""
     app = create_app(settings_of(tmp_path_factory.mktemp("served")))
     with serve_in_thread(app) as url, Client(url) as client:
         data = client.add_dataset(recording(), "steps")["id"]
-        job, _ = identified(
+        job, _ = identify_job(
             app.state.parts, {"model": "fopdt", "datasets": [data], "algorithm": FAST}
         )
         yield url, job
 
 
 @pytest.fixture
-def ask(served: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> "Ask":
-    return Ask(served[0], tmp_path, monkeypatch)
+def ask(server_job: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> "Ask":
+    return Ask(server_job[0], tmp_path, monkeypatch)
 
 
 class Terminal(TextIOWrapper):
@@ -158,23 +158,25 @@ def test_a_download_that_fails_leaves_the_file_as_it_was(ask: Ask, tmp_path: Pat
 
 
 def test_a_report_is_not_overwritten_without_asking(
-    ask: Ask, served: tuple[str, str], tmp_path: Path
+    ask: Ask, server_job: tuple[str, str], tmp_path: Path
 ) -> None:
-    assert ask("report", served[1]).code == 0
+    assert ask("report", server_job[1]).code == 0
     page = (tmp_path / "report.html").read_text()
-    assert "report.html exists" in check_refusal(ask("report", served[1]))
+    assert "report.html exists" in check_refusal(ask("report", server_job[1]))
     (tmp_path / "report.html").write_text("another")
-    assert ask("report", served[1], "--force").code == 0
+    assert ask("report", server_job[1], "--force").code == 0
     assert len((tmp_path / "report.html").read_text()) == len(page)
 
 
-def test_an_answer_on_a_terminal_decides(ask: Ask, served: tuple[str, str], tmp_path: Path) -> None:
+def test_an_answer_on_a_terminal_decides(
+    ask: Ask, server_job: tuple[str, str], tmp_path: Path
+) -> None:
     (tmp_path / "report.html").write_text("mine")
-    refused = ask("report", served[1], stdin="n\n", kind=Terminal)
+    refused = ask("report", server_job[1], stdin="n\n", kind=Terminal)
     assert refused.code == 1
     assert "report.html exists. Overwrite it? [y/N]" in refused.stderr
     assert (tmp_path / "report.html").read_text() == "mine"
-    assert ask("report", served[1], stdin="y\n", kind=Terminal).code == 0
+    assert ask("report", server_job[1], stdin="y\n", kind=Terminal).code == 0
     assert (tmp_path / "report.html").read_text() != "mine"
 
 
@@ -185,8 +187,8 @@ def test_control_of_a_job_answers_in_json(ask: Ask) -> None:
     assert ask.read_json("cancel", job["id"])["state"] == "cancelled"
 
 
-def test_an_export_in_json_is_the_document(ask: Ask, served: tuple[str, str]) -> None:
-    (run,) = ask.read_json("runs", served[1])
+def test_an_export_in_json_is_the_document(ask: Ask, server_job: tuple[str, str]) -> None:
+    (run,) = ask.read_json("runs", server_job[1])
     document = ask.read_json("export", run["id"])
     assert document == json.loads(ask("export", run["id"]).stdout)
     line = check_refusal(ask("export", run["id"], "--format", "c", "--json"), 2)
@@ -224,11 +226,13 @@ def test_the_database_answers_in_json(tmp_path: Path) -> None:
     assert read_answer("downgrade", "base", "--yes") == {"revision": "base"}
 
 
-def test_a_follower_that_is_quiet_prints_the_result_only(ask: Ask, served: tuple[str, str]) -> None:
-    loud, quiet = ask("watch", served[1]), ask("watch", served[1], "--quiet")
+def test_a_follower_that_is_quiet_prints_the_result_only(
+    ask: Ask, server_job: tuple[str, str]
+) -> None:
+    loud, quiet = ask("watch", server_job[1]), ask("watch", server_job[1], "--quiet")
     assert "succeeded" in loud.stderr
     assert quiet.stderr == ""
-    (run,) = ask.read_json("runs", served[1])
+    (run,) = ask.read_json("runs", server_job[1])
     assert run["id"] in quiet.stdout
     assert "note: " not in quiet.stdout
     assert ("note: " in loud.stdout) == bool(run["warnings"])

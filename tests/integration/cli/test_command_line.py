@@ -23,16 +23,16 @@ from service.client.embedded import find_free_port
 from service.storage.migrate import find_head_revision
 from sysid.core.errors import InvalidSettings
 from sysid.identification import identify
-from tests.commands import (
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.service.commands import (
     PROGRAM,
     check_refusal,
     make_environment,
     run_lagid,
     run_lagid_process,
 )
-from tests.limits import LIMIT_SECONDS
-from tests.rest import recording, settings_of
-from tests.serving import serve_in_thread
+from tests.support.service.web_app import recording, settings_of
+from tests.support.service.web_server import serve_in_thread
 
 pytestmark = pytest.mark.slow  # some are processes of their own, and one identifies
 

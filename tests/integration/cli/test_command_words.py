@@ -5,8 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import CommandResult, check_refusal, run_lagid, run_lagid_process
-from tests.rest import recording
+from tests.support.service.commands import (
+    CommandResult,
+    check_refusal,
+    run_lagid,
+    run_lagid_process,
+)
+from tests.support.service.web_app import recording
 
 
 @pytest.mark.parametrize(

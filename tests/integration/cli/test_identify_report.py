@@ -8,8 +8,8 @@ import pytest
 
 from service.core import extras
 from service.pages.render import plotly_script
-from tests.commands import check_refusal, run_lagid
-from tests.rest import recording
+from tests.support.service.commands import check_refusal, run_lagid
+from tests.support.service.web_app import recording
 
 QUICK = ("--set", "algorithm.population=40", "--set", "algorithm.generations=60")
 WORDS = ("--model", "fopdt", "--set", "validation.fraction=0.3", *QUICK)

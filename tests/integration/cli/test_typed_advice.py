@@ -20,8 +20,8 @@ from service.jobs.schemas import JobIn
 from service.plants.tube import Tube
 from sysid.core.text import SETTING, rewrite_settings
 from sysid.identification.arguments import write_setting
-from tests.commands import run_lagid
-from tests.sources import list_modules
+from tests.support.service.commands import run_lagid
+from tests.support.source_facts import list_modules
 
 OPEN = "…"
 """Stands in a text for what is known when it is written."""

@@ -13,11 +13,11 @@ from service.api.dependencies import Parts
 from service.client.client import Client
 from service.core.states import JobState
 from service.repositories.jobs import JobRepository
-from tests.identified import carried_out
-from tests.limits import LIMIT_SECONDS
-from tests.repository import ROOT
-from tests.rest import settings_of
-from tests.serving import serve_in_thread
+from tests.support.checkout import ROOT
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.service.local_runs import carry_out_job
+from tests.support.service.web_app import settings_of
+from tests.support.service.web_server import serve_in_thread
 
 PAGE = (ROOT / "docs/client.md").read_text(encoding="utf-8")
 SNIPPETS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
@@ -37,7 +37,7 @@ class _Worker(threading.Thread):
                 queued = JobRepository(session).list_page(limit=10, states=[JobState.QUEUED]).items
                 waiting = [job.id for job in queued]
             for job in reversed(waiting):
-                carried_out(self._parts, job)
+                carry_out_job(self._parts, job)
 
 
 @pytest.fixture

@@ -15,10 +15,10 @@ import pytest
 
 from service.api.write_contract import DOCUMENT_FILE
 from service.client.embedded import run_embedded_service
-from tests.limits import LIMIT_SECONDS
-from tests.needs import report_missing
-from tests.repository import ROOT
-from tests.rest import recording
+from tests.support.checkout import ROOT
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.requirements import report_missing
+from tests.support.service.web_app import recording
 
 pytestmark = [pytest.mark.night, pytest.mark.ray, pytest.mark.slow]
 
@@ -30,7 +30,7 @@ SMALL = {"population": 20, "generations": 40}
 
 
 @pytest.fixture(scope="module")
-def generated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def generated_package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """The package that the generator writes from the committed document."""
     program = shutil.which(GENERATOR)
     if program is None:
@@ -86,10 +86,10 @@ class Generated:
 
 
 @pytest.fixture(scope="module")
-def remote(generated: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Generated]:
+def remote(generated_package: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Generated]:
     folder = tmp_path_factory.mktemp("data")
     with run_embedded_service(folder / "data", cpus=1) as url:
-        remote = Generated(generated, url)
+        remote = Generated(generated_package, url)
         yield remote
         remote.close()
 
@@ -108,7 +108,7 @@ def simulate(remote: Generated, name: str, delay: float) -> str:
     return str(stored.id)
 
 
-def test_use_1_a_recording_is_identified(remote: Generated, generated: Any) -> None:
+def test_use_1_a_recording_is_identified(remote: Generated, generated_package: Any) -> None:
     types = importlib.import_module(f"{PACKAGE}.types")
     file = types.File(payload=BytesIO(recording()), mime_type="application/octet-stream")
     stored = remote.call("datasets", "add_dataset", body=file, name="steps")

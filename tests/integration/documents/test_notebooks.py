@@ -8,8 +8,8 @@ import pytest
 
 from service.pages.guides import list_notebooks, make_notebook
 from tests.documents.tutorials import find_free_port
-from tests.needs import report_missing
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
+from tests.support.requirements import report_missing
 
 CELL_SECONDS = 400
 

@@ -7,7 +7,7 @@ import numpy as np
 from sysid.data.records import Channel, Record
 from sysid.models.documents import parse_yaml
 from tests.documents.tutorials import run_cell
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 PAGE = (ROOT / "docs/polynomials.md").read_text(encoding="utf-8")
 

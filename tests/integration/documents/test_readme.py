@@ -13,11 +13,11 @@ import pytest
 from service.api.app import create_app
 from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.leases import HeldLeases
-from tests.inline_executor import InlineExecutor
-from tests.limits import LIMIT_SECONDS
-from tests.repository import ROOT
-from tests.rest import settings_of
-from tests.serving import serve_in_thread
+from tests.support.checkout import ROOT
+from tests.support.cluster.inline_executor import InlineExecutor
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.service.web_app import settings_of
+from tests.support.service.web_server import serve_in_thread
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 

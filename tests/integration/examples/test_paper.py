@@ -8,7 +8,7 @@ import pytest
 
 from examples.paper.__main__ import main
 from service.client.client import Client
-from tests.standing import Service
+from tests.support.service.whole_service import Service
 
 pytestmark = [pytest.mark.slow, pytest.mark.ray, pytest.mark.timeout(600)]
 

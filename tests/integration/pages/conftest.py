@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.filled import Filled, copy_filled
+from tests.support.service.filled_folder import FilledFolder, copy_filled
 
 
 @pytest.fixture(scope="module")
@@ -13,5 +13,5 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def filled(folder: Path) -> Filled:
+def filled_folder(folder: Path) -> FilledFolder:
     return copy_filled(folder)

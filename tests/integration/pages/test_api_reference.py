@@ -6,7 +6,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
-from tests.rest import settings_of
+from tests.support.service.web_app import settings_of
 
 
 @pytest.fixture(scope="module")

@@ -28,15 +28,15 @@ from sysid.data.records import Channel, Recording
 from sysid.figures.data import ExperimentTraces, OutputTraces, SignalTrace
 from sysid.figures.signals import plot_comparison
 from sysid.models.catalogue.load import copy_catalogue_document
-from tests.e2e.filled import Filled
-from tests.rest import parts_of, settings_of
+from tests.support.service.filled_folder import FilledFolder
+from tests.support.service.web_app import parts_of, settings_of
 
 
 @pytest.fixture(scope="module")
-def client(folder: Path, filled: Filled) -> Iterator[TestClient]:
+def client(folder: Path, filled_folder: FilledFolder) -> Iterator[TestClient]:
     with TestClient(create_app(settings_of(folder))) as opened:
         with parts_of(opened).database.write_session() as session:
-            accept_reference(session, "tube", ReferenceIn(run=filled.finished_run, by="Ada"))
+            accept_reference(session, "tube", ReferenceIn(run=filled_folder.finished_run, by="Ada"))
         yield opened
 
 
@@ -46,10 +46,12 @@ def list_jobs(client: TestClient, query: str) -> list[str]:
     return re.findall(r'<tr data-job="([^"]*)"', answer.text)
 
 
-def test_the_form_of_the_list_of_jobs_finds_and_sorts(client: TestClient, filled: Filled) -> None:
-    assert list_jobs(client, "sort=fit")[:2] == [filled.finished, filled.sweep]
-    assert list_jobs(client, "sort=worst-fit")[:2] == [filled.sweep, filled.finished]
-    assert list_jobs(client, "state=failed&name=&model=lagged-tube&sort=") == [filled.failed]
+def test_the_form_of_the_list_of_jobs_finds_and_sorts(
+    client: TestClient, filled_folder: FilledFolder
+) -> None:
+    assert list_jobs(client, "sort=fit")[:2] == [filled_folder.finished, filled_folder.sweep]
+    assert list_jobs(client, "sort=worst-fit")[:2] == [filled_folder.sweep, filled_folder.finished]
+    assert list_jobs(client, "state=failed&name=&model=lagged-tube&sort=") == [filled_folder.failed]
     assert list_jobs(client, "state=failed&name=tube") == []
     page = client.get("/?sort=fit").text
     assert 'aria-sort="descending"><a class="plain" href="/?sort=worst-fit">Fit</a>' in page
@@ -58,7 +60,7 @@ def test_the_form_of_the_list_of_jobs_finds_and_sorts(client: TestClient, filled
         answer = client.get(f"/?{query}")
         assert answer.status_code == 422
         assert told in answer.text
-    following = client.get(f"/?sort=name&cursor={filled.finished}").text
+    following = client.get(f"/?sort=name&cursor={filled_folder.finished}").text
     assert 'href="/?sort=name"' in following  # back to the first page, in the same order
 
 
@@ -90,29 +92,31 @@ def test_runs_on_other_data_are_drawn_over_their_own_measured_output() -> None:
 
 
 def test_a_comparison_of_other_data_says_what_does_not_compare(
-    client: TestClient, filled: Filled
+    client: TestClient, filled_folder: FilledFolder
 ) -> None:
     parts = parts_of(client)
     with parts.database.write_session() as session:
-        job = session.get_one(Job, filled.sweep)
+        job = session.get_one(Job, filled_folder.sweep)
         before = job.spec
         job.spec = {**before, "skip": 7}
     try:
-        page = client.get(f"/compare?run={filled.sweep_run}&run={filled.finished_run}").text
+        page = client.get(
+            f"/compare?run={filled_folder.sweep_run}&run={filled_folder.finished_run}"
+        ).text
         assert "on different data" in page
         assert "tube 40 m, pattern 1 has another number of skipped samples" in page
         assert page.index(">three methods, four seeds<") < page.index(">tube 40 m, pattern 1<")
         refused = client.post(
-            "/v1/runs:compare", json={"runs": [filled.sweep_run, filled.finished_run]}
+            "/v1/runs:compare", json={"runs": [filled_folder.sweep_run, filled_folder.finished_run]}
         )
         assert refused.status_code == 422  # programs must say what they compare
     finally:
         with parts.database.write_session() as session:
-            session.get_one(Job, filled.sweep).spec = before
+            session.get_one(Job, filled_folder.sweep).spec = before
 
 
 def test_models_are_shown_with_equations_parameters_and_the_jobs_that_used_them(
-    client: TestClient, filled: Filled
+    client: TestClient, filled_folder: FilledFolder
 ) -> None:
     gallery = client.get("/models").text
     assert gallery.count("<math") > 20
@@ -124,7 +128,7 @@ def test_models_are_shown_with_equations_parameters_and_the_jobs_that_used_them(
     assert '<th scope="row">T</th><td>time constant</td><td>s</td>' in page
     assert "follows the data: 0 … half the shortest record" in page
     assert "Typical systems:" in page
-    assert f'<option value="{filled.dataset}">' in page
+    assert f'<option value="{filled_folder.dataset}">' in page
     assert "None yet." in page
     document = {**copy_catalogue_document("fopdt"), "name": "lagged-tube", "title": "<i>mine</i>"}
     with parts_of(client).database.write_session() as session:
@@ -134,7 +138,7 @@ def test_models_are_shown_with_equations_parameters_and_the_jobs_that_used_them(
     own = client.get("/models/lagged-tube@1").text
     assert "&lt;i&gt;mine&lt;/i&gt;" in own
     assert "changed" not in own
-    assert f'href="/jobs/{filled.finished}"' in own
+    assert f'href="/jobs/{filled_folder.finished}"' in own
     assert client.get("/models/fopdd").status_code == 404
     assert "fopdt" in client.get("/models/fopdd").text
 
@@ -149,7 +153,7 @@ def test_every_built_in_model_has_a_page_and_a_typical_system(client: TestClient
 
 
 def test_references_are_listed_with_units_and_what_is_compared_with_them(
-    client: TestClient, filled: Filled
+    client: TestClient, filled_folder: FilledFolder
 ) -> None:
     listed = client.get("/references?name=TUB").text
     assert 'href="/references/tube"' in listed
@@ -157,28 +161,32 @@ def test_references_are_listed_with_units_and_what_is_compared_with_them(
     assert "No reference meets all conditions" in client.get("/references?name=pipe").text
     page = client.get("/references/tube").text
     assert "by Ada" in page
-    assert f'href="/runs/{filled.finished_run}"' in page
+    assert f'href="/runs/{filled_folder.finished_run}"' in page
     assert "No job yet." in page
     with parts_of(client).database.write_session() as session:
-        LineageRepository(session).add_links(filled.queued, [filled.finished_run], "reference")
+        LineageRepository(session).add_links(
+            filled_folder.queued, [filled_folder.finished_run], "reference"
+        )
     page = client.get("/references/tube").text
-    assert f'href="/jobs/{filled.queued}"' in page
+    assert f'href="/jobs/{filled_folder.queued}"' in page
     assert "compared with it" in page
     assert client.get("/references/pipe").status_code == 404
 
 
-def test_the_lineage_of_a_job_is_drawn_with_links(client: TestClient, filled: Filled) -> None:
-    page = client.get(f"/jobs/{filled.finished}").text
+def test_the_lineage_of_a_job_is_drawn_with_links(
+    client: TestClient, filled_folder: FilledFolder
+) -> None:
+    page = client.get(f"/jobs/{filled_folder.finished}").text
     drawn = page[page.index('<svg class="lineage"') :].partition("</svg>")[0]
-    assert f'<a href="/datasets/{filled.dataset}" aria-label="recording tube 40 m">' in drawn
-    assert f'<a href="/runs/{filled.finished_run}" aria-label="run 1 of tube' in drawn
+    assert f'<a href="/datasets/{filled_folder.dataset}" aria-label="recording tube 40 m">' in drawn
+    assert f'<a href="/runs/{filled_folder.finished_run}" aria-label="run 1 of tube' in drawn
     assert drawn.count('<g class="shown">') == 1
     assert 'aria-label="reference tube"' in drawn
-    assert f'href="/jobs/{filled.sweep}"' not in drawn  # it only used the same recording
+    assert f'href="/jobs/{filled_folder.sweep}"' not in drawn  # it only used the same recording
 
 
 def test_the_lineage_of_an_open_job_follows_when_it_has_ended(
-    client: TestClient, filled: Filled, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, filled_folder: FilledFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[str] = []
 
@@ -187,14 +195,22 @@ def test_the_lineage_of_an_open_job_follows_when_it_has_ended(
         return draw_lineage(session, shown)
 
     monkeypatch.setattr(pages, "draw_lineage", draw)
-    shown = {job: client.get(f"/jobs/{job}").text for job in (filled.running, filled.finished)}
-    assert drawn == [filled.finished]
+    shown = {
+        job: client.get(f"/jobs/{job}").text
+        for job in (filled_folder.running, filled_folder.finished)
+    }
+    assert drawn == [filled_folder.finished]
     region = '<div data-live="lineage">'
-    assert f'{region}<p class="muted">Drawn when the job has ended.</p>' in shown[filled.running]
-    assert '<svg class="lineage"' in shown[filled.finished].partition(region)[2]
+    assert (
+        f'{region}<p class="muted">Drawn when the job has ended.</p>'
+        in shown[filled_folder.running]
+    )
+    assert '<svg class="lineage"' in shown[filled_folder.finished].partition(region)[2]
 
 
-def test_the_lineage_of_a_recording_is_drawn_with_links(client: TestClient, filled: Filled) -> None:
+def test_the_lineage_of_a_recording_is_drawn_with_links(
+    client: TestClient, filled_folder: FilledFolder
+) -> None:
     parts = parts_of(client)
     channel = Channel("u", np.array([0.0, 1.0]), np.array([1.0, 2.0]), "V")
     long_name = "a part of it with a very long name & more"
@@ -208,11 +224,11 @@ def test_the_lineage_of_a_recording_is_drawn_with_links(client: TestClient, fill
         details={"warnings": []},
     ).dataset.id
     with parts.database.write_session() as session:
-        LineageRepository(session).add_links(part, [filled.dataset], "derived")
-    drawing = client.get(f"/datasets/{filled.dataset}").text.partition('class="lineage"')[2]
+        LineageRepository(session).add_links(part, [filled_folder.dataset], "derived")
+    drawing = client.get(f"/datasets/{filled_folder.dataset}").text.partition('class="lineage"')[2]
     for target in (
-        f"/jobs/{filled.sweep}",
-        f"/runs/{filled.finished_run}",
+        f"/jobs/{filled_folder.sweep}",
+        f"/runs/{filled_folder.finished_run}",
         "/references/tube",
         f"/datasets/{part}",
     ):
@@ -220,8 +236,8 @@ def test_the_lineage_of_a_recording_is_drawn_with_links(client: TestClient, fill
     assert long_name.replace("&", "&amp;")[: MAX_CHARACTERS - 1] + "…</text>" in drawing
     assert '<g class="shown"><title>tube 40 m</title>' in drawing
     upwards = client.get(f"/datasets/{part}").text.partition('class="lineage"')[2]
-    assert f'<a href="/datasets/{filled.dataset}"' in upwards
-    assert f"/jobs/{filled.sweep}" not in upwards  # made from its parent, not from it
+    assert f'<a href="/datasets/{filled_folder.dataset}"' in upwards
+    assert f"/jobs/{filled_folder.sweep}" not in upwards  # made from its parent, not from it
 
 
 @pytest.mark.parametrize("hold", HOLDS)
@@ -269,15 +285,18 @@ def test_health_tells_what_works_and_settings_where_they_come_from(
 
 
 def test_one_parameter_of_the_runs_of_all_jobs_is_a_table_a_figure_and_a_file(
-    client: TestClient, filled: Filled
+    client: TestClient, filled_folder: FilledFolder
 ) -> None:
     page = client.get("/results?parameter=L").text
     assert page.count('<input type="checkbox" name="run"') == 13
     assert "<b>0.11270</b> ± 0.00023\u202fs" in page
     assert '<option value="/seed">seed</option>' in page
-    assert f'href="/v1/jobs/{filled.sweep}/runs.csv"' in client.get(f"/jobs/{filled.sweep}").text
+    assert (
+        f'href="/v1/jobs/{filled_folder.sweep}/runs.csv"'
+        in client.get(f"/jobs/{filled_folder.sweep}").text
+    )
     best = client.get("/results?parameter=L&runs=best&name=four seeds").text
-    assert re.findall(r'name="run" value="([^"]*)"', best) == [filled.sweep_run]
+    assert re.findall(r'name="run" value="([^"]*)"', best) == [filled_folder.sweep_run]
     figure = client.get("/pages/results/figure?parameter=L&over=/seed&theme=dark").json()
     [points] = figure["data"]
     assert sorted(points["x"]) == sorted([1, 2, 3, 4] * 3)  # the run without a seed is left out

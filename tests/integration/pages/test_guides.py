@@ -8,8 +8,8 @@ from starlette.testclient import TestClient
 
 from service.api.app import create_app
 from service.pages import guides
-from tests.repository import ROOT
-from tests.rest import settings_of
+from tests.support.checkout import ROOT
+from tests.support.service.web_app import settings_of
 
 FOLDERS = ("", "tutorials", "howto", "answers", "explanation", "decisions", "notes")
 PAGES = sorted(

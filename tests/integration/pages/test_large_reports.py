@@ -20,8 +20,8 @@ from service.queue.leases import Claim, LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
-from tests.rest import parts_of, recording, settings_of, store_csv
-from tests.results import write_result
+from tests.support.service.web_app import parts_of, recording, settings_of, store_csv
+from tests.support.storage.run_results import write_result
 
 N_SIGMA, N_SEEDS = 40, 105  # times the two methods: 8,400 asked for, the first 2,000 of them made
 WHY = "the model diverged <everywhere>"

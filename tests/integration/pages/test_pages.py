@@ -14,12 +14,12 @@ from service.datasets.datasets import add_recording
 from service.pages import render
 from service.storage.tables import Job
 from sysid.data.records import Channel, Recording
-from tests.e2e.filled import Filled
-from tests.rest import parts_of, settings_of
+from tests.support.service.filled_folder import FilledFolder
+from tests.support.service.web_app import parts_of, settings_of
 
 
 @pytest.fixture(scope="module")
-def client(folder: Path, filled: Filled) -> Iterator[TestClient]:
+def client(folder: Path, filled_folder: FilledFolder) -> Iterator[TestClient]:
     with TestClient(create_app(settings_of(folder))) as opened:
         yield opened
 
@@ -37,15 +37,15 @@ def test_pages_run_no_script_but_those_of_the_service(client: TestClient) -> Non
     assert "default-src 'none'" in policy
 
 
-def test_no_page_names_another_host(client: TestClient, filled: Filled) -> None:
-    for path in ("/", f"/jobs/{filled.finished}", f"/datasets/{filled.dataset}"):
+def test_no_page_names_another_host(client: TestClient, filled_folder: FilledFolder) -> None:
+    for path in ("/", f"/jobs/{filled_folder.finished}", f"/datasets/{filled_folder.dataset}"):
         text = client.get(path).text
         assert 'src="http' not in text
         assert 'href="http' not in text
 
 
-def test_what_a_user_writes_is_escaped(client: TestClient, filled: Filled) -> None:
-    for path in ("/", f"/jobs/{filled.running}", f"/v1/jobs/{filled.running}/report"):
+def test_what_a_user_writes_is_escaped(client: TestClient, filled_folder: FilledFolder) -> None:
+    for path in ("/", f"/jobs/{filled_folder.running}", f"/v1/jobs/{filled_folder.running}/report"):
         text = client.get(path).text
         assert "tube 80 m &lt;b&gt;live&lt;/b&gt;" in text
         assert "<b>live" not in text
@@ -69,9 +69,13 @@ def test_what_is_not_there_is_not_found(client: TestClient, path: str) -> None:
     assert answer.headers["content-type"] == "application/problem+json"
 
 
-def test_the_pages_of_jobs_follow_each_other(client: TestClient, filled: Filled) -> None:
+def test_the_pages_of_jobs_follow_each_other(
+    client: TestClient, filled_folder: FilledFolder
+) -> None:
     assert client.get("/").text.count('<tr data-job="') == 5
-    assert client.get("/", params={"cursor": filled.failed}).text.count('<tr data-job="') == 2
+    assert (
+        client.get("/", params={"cursor": filled_folder.failed}).text.count('<tr data-job="') == 2
+    )
 
 
 def test_plotly_is_served_compressed_and_kept_forever(client: TestClient) -> None:
@@ -94,9 +98,9 @@ def test_an_unchanged_file_is_not_sent_again(client: TestClient) -> None:
     "name", ["history", "convergence", "response", "correlation", "waterfall", "posterior"]
 )
 def test_every_figure_comes_as_plotly_json_and_as_csv(
-    client: TestClient, filled: Filled, name: str
+    client: TestClient, filled_folder: FilledFolder, name: str
 ) -> None:
-    path = f"/v1/runs/{filled.finished_run}/figures/{name}"
+    path = f"/v1/runs/{filled_folder.finished_run}/figures/{name}"
     figure = client.get(path).json()
     assert set(figure) == {"data", "layout"}
     assert figure["data"]
@@ -116,32 +120,40 @@ def test_every_figure_comes_as_plotly_json_and_as_csv(
     ],
 )
 def test_a_figure_that_cannot_be_made_is_a_fault_of_the_request(
-    client: TestClient, filled: Filled, name: str, query: str
+    client: TestClient, filled_folder: FilledFolder, name: str, query: str
 ) -> None:
-    answer = client.get(f"/v1/runs/{filled.finished_run}/figures/{name}?{query}")
+    answer = client.get(f"/v1/runs/{filled_folder.finished_run}/figures/{name}?{query}")
     assert answer.status_code == 422
     assert answer.json()["errors"]
 
 
-def test_an_experiment_beyond_the_last_is_not_found(client: TestClient, filled: Filled) -> None:
-    path = f"/v1/runs/{filled.finished_run}/figures/response?experiment=1"
+def test_an_experiment_beyond_the_last_is_not_found(
+    client: TestClient, filled_folder: FilledFolder
+) -> None:
+    path = f"/v1/runs/{filled_folder.finished_run}/figures/response?experiment=1"
     assert "the last is 0" in client.get(path).json()["detail"]
 
 
-def test_the_response_joins_the_parts_of_one_record(client: TestClient, filled: Filled) -> None:
-    path = f"/v1/runs/{filled.finished_run}/figures/response"
+def test_the_response_joins_the_parts_of_one_record(
+    client: TestClient, filled_folder: FilledFolder
+) -> None:
+    path = f"/v1/runs/{filled_folder.finished_run}/figures/response"
     layout = client.get(path).json()["layout"]
     assert layout["meta"]["experiments"] == ["record 1"]
     assert layout["shapes"][0]["x0"] == 21.0
 
 
-def test_a_run_that_has_not_ended_has_an_empty_response(client: TestClient, filled: Filled) -> None:
-    path = f"/v1/runs/{filled.running_run}/figures/response"
+def test_a_run_that_has_not_ended_has_an_empty_response(
+    client: TestClient, filled_folder: FilledFolder
+) -> None:
+    path = f"/v1/runs/{filled_folder.running_run}/figures/response"
     assert client.get(path).json()["data"] == []
 
 
-def test_the_report_of_a_job_names_no_other_file(client: TestClient, filled: Filled) -> None:
-    answer = client.get(f"/v1/jobs/{filled.sweep}/report")
+def test_the_report_of_a_job_names_no_other_file(
+    client: TestClient, filled_folder: FilledFolder
+) -> None:
+    answer = client.get(f"/v1/jobs/{filled_folder.sweep}/report")
     head = answer.text[: answer.text.index("<style>")]
     assert answer.status_code == 200
     assert "src=" not in head
@@ -158,31 +170,33 @@ def test_a_model_is_shown_as_yaml(client: TestClient) -> None:
     assert "equations:" in answer.text
 
 
-def test_the_list_tells_how_the_runs_of_a_sweep_ended(client: TestClient, filled: Filled) -> None:
+def test_the_list_tells_how_the_runs_of_a_sweep_ended(
+    client: TestClient, filled_folder: FilledFolder
+) -> None:
     rows = client.get("/").text.split("<tr data-job=")
-    (sweep,) = (row for row in rows if row.startswith(f'"{filled.sweep}"'))
-    (single,) = (row for row in rows if row.startswith(f'"{filled.finished}"'))
+    (sweep,) = (row for row in rows if row.startswith(f'"{filled_folder.sweep}"'))
+    (single,) = (row for row in rows if row.startswith(f'"{filled_folder.finished}"'))
     assert "best of 12 succeeded" in sweep
     assert "succeeded</small>" not in single
 
 
 def test_the_list_tells_the_verdict_fit_and_warnings_of_each_result(
-    client: TestClient, filled: Filled
+    client: TestClient, filled_folder: FilledFolder
 ) -> None:
     rows = client.get("/").text.split("<tr data-job=")
-    (single,) = (row for row in rows if row.startswith(f'"{filled.finished}"'))
+    (single,) = (row for row in rows if row.startswith(f'"{filled_folder.finished}"'))
     assert '<span class="trust trustworthy">trustworthy</span>' in single
     assert "99.71 %" in single
     assert '<td class="n" data-label="warnings">1</td>' in single  # its warning
-    (running,) = (row for row in rows if row.startswith(f'"{filled.running}"'))
+    (running,) = (row for row in rows if row.startswith(f'"{filled_folder.running}"'))
     assert 'class="trust' not in running
 
 
 def test_results_of_two_jobs_are_compared_under_different_names(
-    client: TestClient, filled: Filled
+    client: TestClient, filled_folder: FilledFolder
 ) -> None:
     jobs = {job["id"]: job for job in client.get("/v1/jobs").json()["items"]}
-    outcomes = [jobs[job]["outcome"] for job in (filled.finished, filled.sweep)]
+    outcomes = [jobs[job]["outcome"] for job in (filled_folder.finished, filled_folder.sweep)]
     assert [outcome["trust"] for outcome in outcomes] == ["trustworthy", "trustworthy"]
     query = "&".join(f"run={outcome['run']}" for outcome in outcomes)
     page = client.get(f"/compare?{query}").text
@@ -203,14 +217,14 @@ def test_results_of_two_jobs_are_compared_under_different_names(
 
 
 def test_starts_are_told_apart_from_dispatchers_that_were_lost(
-    client: TestClient, filled: Filled
+    client: TestClient, filled_folder: FilledFolder
 ) -> None:
     parts = parts_of(client)
-    page = client.get(f"/jobs/{filled.finished}").text
+    page = client.get(f"/jobs/{filled_folder.finished}").text
     assert "dispatchers lost" not in page
     with parts.database.write_session() as session:
-        session.get(Job, filled.finished).lost_leases = 1
-    page = client.get(f"/jobs/{filled.finished}").text
+        session.get(Job, filled_folder.finished).lost_leases = 1
+    page = client.get(f"/jobs/{filled_folder.finished}").text
     assert "1 of at most 3 dispatchers lost" in page
 
 
@@ -275,8 +289,8 @@ def test_every_column_of_a_page_has_a_heading() -> None:
 
 
 def test_why_the_one_run_of_a_job_failed_is_told_once_above_its_model(
-    client: TestClient, filled: Filled
+    client: TestClient, filled_folder: FilledFolder
 ) -> None:
-    text = client.get(f"/jobs/{filled.failed}").text
+    text = client.get(f"/jobs/{filled_folder.failed}").text
     assert text[: text.index("<h2>Model</h2>")].count('class="note bad"') == 1
     assert "The run failed:" in text

@@ -11,17 +11,17 @@ from starlette.testclient import TestClient
 from service.api.app import create_app
 from service.core.settings import Settings
 from service.pages.render import STATIC_FOLDER
-from tests.e2e.filled import Filled
-from tests.rest import CSV, recording, settings_of
+from tests.support.service.filled_folder import FilledFolder
+from tests.support.service.web_app import CSV, recording, settings_of
 
 ROOT_PATH = "/tools/lagid"
 ADDRESSES = re.compile(r'(?:href|src|action|data-url|data-profile)="(/[^"]*)"')
 
 
 @pytest.fixture(scope="module")
-def server(folder: Path, filled: Filled) -> Iterator[TestClient]:
+def server(folder: Path, filled_folder: FilledFolder) -> Iterator[TestClient]:
     """The application with LAGID_ROOT_PATH; the path of a request is that behind the proxy."""
-    assert filled.finished
+    assert filled_folder.finished
     with TestClient(create_app(settings_of(folder, root_path=ROOT_PATH))) as client:
         yield client
 
@@ -31,9 +31,9 @@ def list_addresses(text: str) -> set[str]:
 
 
 def test_every_address_of_every_page_has_the_root_path_and_answers(
-    server: TestClient, filled: Filled
+    server: TestClient, filled_folder: FilledFolder
 ) -> None:
-    ways = [f"{ROOT_PATH}/", f"{ROOT_PATH}/jobs/{filled.finished}", f"{ROOT_PATH}/nothing"]
+    ways = [f"{ROOT_PATH}/", f"{ROOT_PATH}/jobs/{filled_folder.finished}", f"{ROOT_PATH}/nothing"]
     seen: set[str] = set()
     while ways and len(seen) < 60:
         way = ways.pop(0)
@@ -65,15 +65,19 @@ def test_rest_answers_with_the_root_path_whether_or_not_a_proxy_strips_it(
     assert server.get(f"{prefix}/openapi.json").json()["servers"] == [{"url": ROOT_PATH}]
 
 
-def test_reports_and_commands_name_the_whole_address(server: TestClient, filled: Filled) -> None:
-    page = server.get(f"{ROOT_PATH}/jobs/{filled.finished}").text
+def test_reports_and_commands_name_the_whole_address(
+    server: TestClient, filled_folder: FilledFolder
+) -> None:
+    page = server.get(f"{ROOT_PATH}/jobs/{filled_folder.finished}").text
     assert f"http://testserver{ROOT_PATH}/v1/jobs" in page
-    report = server.get(f"{ROOT_PATH}/v1/jobs/{filled.finished}/report").text
+    report = server.get(f"{ROOT_PATH}/v1/jobs/{filled_folder.finished}/report").text
     assert list_addresses(report) == set()  # it needs no server
 
 
-def test_events_are_streamed_below_the_root_path(server: TestClient, filled: Filled) -> None:
-    text = server.get(f"{ROOT_PATH}/v1/jobs/{filled.finished}/events").text
+def test_events_are_streamed_below_the_root_path(
+    server: TestClient, filled_folder: FilledFolder
+) -> None:
+    text = server.get(f"{ROOT_PATH}/v1/jobs/{filled_folder.finished}/events").text
     assert "event: end" in text
 
 

@@ -23,9 +23,9 @@ from sysid.models.catalogue.load import load_model
 from sysid.search import refine
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
-from tests.e2e.filled import copy_filled
-from tests.identified import identified
-from tests.rest import parts_of, refused, settings_of, store_csv
+from tests.support.service.filled_folder import copy_filled
+from tests.support.service.local_runs import identify_job
+from tests.support.service.web_app import parts_of, read_faults, settings_of, store_csv
 
 INPUT = {"kind": "binary", "period": 2}
 TRUE = {"K": 2.0, "T": 1.0, "L": 0.5}
@@ -33,7 +33,7 @@ NOISELESS = {"model": "fopdt", "inputs": {"u": INPUT}, "samples": 200, "sample_t
 
 
 @dataclass(frozen=True)
-class Place:
+class SimulationSite:
     """A client, a run that found the true parameters, and recordings to run it over."""
 
     client: TestClient
@@ -45,19 +45,19 @@ class Place:
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulationSite]:
     with TestClient(create_app(settings_of(tmp_path_factory.mktemp("simulated")))) as client:
 
-        def made(name: str, parameters: dict[str, float], **changes: Any) -> str:
+        def simulate_dataset(name: str, parameters: dict[str, float], **changes: Any) -> str:
             body = {**NOISELESS, "name": name, "parameters": parameters, **changes}
             answer = client.post("/v1/datasets:simulate", json=body)
             assert answer.status_code == 201, answer.text
             return str(answer.json()["id"])
 
-        fitted = made("fitted", {**TRUE, "y0": 0})
+        fitted = simulate_dataset("fitted", {**TRUE, "y0": 0})
         seeds = {"inputs": {"u": {**INPUT, "seed": 5}}}
-        other = made("other", {**TRUE, "y0": 0, "x(0)": 1}, **seeds)
-        faster = made("faster", {**TRUE, "T": 0.3, "y0": 0}, **seeds)
+        other = simulate_dataset("other", {**TRUE, "y0": 0, "x(0)": 1}, **seeds)
+        faster = simulate_dataset("faster", {**TRUE, "T": 0.3, "y0": 0}, **seeds)
         answer = client.post(
             "/v1/datasets?name=lonely",
             content=b"t,u\n0,1\n1,2\n2,3\n",
@@ -70,18 +70,20 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
             "parameters": {"L": {"upper": 2}},
             "algorithm": {"stop": {"evaluations": 6000}},
         }
-        _, [run] = identified(parts_of(client), body)
-        yield Place(client, run, other, faster, answer.json()["id"], f"/runs/{run}/simulate")
+        _, [run] = identify_job(parts_of(client), body)
+        yield SimulationSite(
+            client, run, other, faster, answer.json()["id"], f"/runs/{run}/simulate"
+        )
 
 
-def validated(place: Place, **body: Any) -> Any:
-    return place.client.post(f"/v1/runs/{place.run}:validate", json=body)
+def validate_run(site: SimulationSite, **body: Any) -> Any:
+    return site.client.post(f"/v1/runs/{site.run}:validate", json=body)
 
 
 def test_over_a_recording_of_the_same_system_the_model_is_right_wherever_it_starts(
-    place: Place,
+    site: SimulationSite,
 ) -> None:
-    found = validated(place, dataset=place.other).json()
+    found = validate_run(site, dataset=site.other).json()
     assert found["rms"] < 1e-6
     assert found["fit_percent"] > 99.999
     assert found["starts"]["x(0)"] == pytest.approx(1, abs=1e-5)  # it was 0 where it was fitted
@@ -92,19 +94,19 @@ def test_over_a_recording_of_the_same_system_the_model_is_right_wherever_it_star
 
 
 def test_the_start_of_each_record_is_searched_on_it_alone(
-    place: Place, monkeypatch: pytest.MonkeyPatch
+    site: SimulationSite, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = ["series,t,u,y"]
     rows += [f"{n},{0.1 * k:.1f},{(k // 9) % 2},{n * 0.9**k}" for n in range(5) for k in range(60)]
-    stored = store_csv(place.client, "\n".join(rows).encode(), "five", ["series"])
+    stored = store_csv(site.client, "\n".join(rows).encode(), "five", ["series"])
     searched = []
 
-    def noted(problem: Problem, *arguments: Any) -> Any:
+    def note_and_refine(problem: Problem, *arguments: Any) -> Any:
         searched.append([one.name for one in problem.free_parameters])
         return refine_candidates(problem, *arguments)
 
-    monkeypatch.setattr(refine, "refine_candidates", noted)
-    found = validated(place, dataset=stored).json()
+    monkeypatch.setattr(refine, "refine_candidates", note_and_refine)
+    found = validate_run(site, dataset=stored).json()
     assert searched == 5 * [["x(0)"]]
     assert list(found["starts"]) == ["x(0)", *(f"x(0)[{n}]" for n in range(2, 6))]
     starts = list(found["starts"].values())
@@ -112,15 +114,15 @@ def test_the_start_of_each_record_is_searched_on_it_alone(
     assert starts[4] - starts[0] > 1
 
 
-def test_over_a_recording_of_another_system_it_is_not(place: Place) -> None:
-    found = validated(place, dataset=place.faster).json()
+def test_over_a_recording_of_another_system_it_is_not(site: SimulationSite) -> None:
+    found = validate_run(site, dataset=site.faster).json()
     assert 20 < found["fit_percent"] < 95
     [one] = found["agreement"]
     assert (one["output"], one["samples"], one["rms"]) == ("y", 200, found["rms"])
 
 
-def test_samples_that_are_skipped_are_not_judged(place: Place) -> None:
-    found = validated(place, dataset=place.faster, skip=150).json()
+def test_samples_that_are_skipped_are_not_judged(site: SimulationSite) -> None:
+    found = validate_run(site, dataset=site.faster, skip=150).json()
     assert found["agreement"][0]["samples"] == 50
 
 
@@ -133,27 +135,27 @@ def test_samples_that_are_skipped_are_not_judged(place: Place) -> None:
     ],
 )
 def test_what_does_not_fit_is_refused_with_its_place(
-    place: Place, body: dict[str, Any], pointer: str, words: str
+    site: SimulationSite, body: dict[str, Any], pointer: str, words: str
 ) -> None:
-    faults = refused(validated(place, dataset=place.other, **body), 422, "invalid")
+    faults = read_faults(validate_run(site, dataset=site.other, **body), 422, "invalid")
     assert [one["pointer"] for one in faults] == [pointer]
     assert words in faults[0]["detail"]
 
 
-def test_a_recording_without_the_output_is_refused(place: Place) -> None:
-    faults = refused(validated(place, dataset=place.lonely), 422, "invalid")
+def test_a_recording_without_the_output_is_refused(site: SimulationSite) -> None:
+    faults = read_faults(validate_run(site, dataset=site.lonely), 422, "invalid")
     assert faults[0]["pointer"] == "/channels/y"
 
 
-def test_the_form_is_shown_with_the_values_of_the_run(place: Place) -> None:
-    answer = place.client.get(place.page)
+def test_the_form_is_shown_with_the_values_of_the_run(site: SimulationSite) -> None:
+    answer = site.client.get(site.page)
     assert answer.status_code == 200
     assert 'name="duration" value="39.8"' in answer.text
-    signal = place.client.get(f"{place.page}?kind=signal").text
+    signal = site.client.get(f"{site.page}?kind=signal").text
     assert 'name="duration" value="19.9"' in signal
     assert 'name="sample_time" value="0.1"' in answer.text
     assert "figure-simulation" not in answer.text
-    assert f'href="/runs/{place.run}/simulate"' in place.client.get(f"/runs/{place.run}").text
+    assert f'href="/runs/{site.run}/simulate"' in site.client.get(f"/runs/{site.run}").text
 
 
 def test_of_an_irregular_recording_the_form_suggests_its_own_duration_and_density() -> None:
@@ -166,23 +168,25 @@ def test_of_an_irregular_recording_the_form_suggests_its_own_duration_and_densit
     assert _default_values(stored, single)["sample_time"] == "0.01"
 
 
-def test_the_form_suggests_a_step_within_what_was_measured(place: Place) -> None:
-    result = place.client.get(f"/v1/runs/{place.run}").json()
+def test_the_form_suggests_a_step_within_what_was_measured(site: SimulationSite) -> None:
+    result = site.client.get(f"/v1/runs/{site.run}").json()
     low, high = result["agreement"]["estimation"][0]["span"]
-    form = place.client.get(place.page).text
+    form = site.client.get(site.page).text
     before, height = (
         float(re.search(rf'name="{name}" value="([^"]*)"', form)[1])  # type: ignore[index]
         for name in ("offset", "amplitude")
     )
     assert low < before < before + height < high
-    asked = place.client.get(f"{place.page}?gain=0.5&duration=5&sample_time=0.1").text
+    asked = site.client.get(f"{site.page}?gain=0.5&duration=5&sample_time=0.1").text
     assert 'name="offset" value="0"' in asked  # what was simulated, not what is suggested
     assert 'name="amplitude" value="1"' in asked
     assert 'name="time" value="0"' in asked
 
 
-def test_the_form_suggests_the_controller_of_a_rule_if_the_model_allows_one(place: Place) -> None:
-    form = place.client.get(place.page).text
+def test_the_form_suggests_the_controller_of_a_rule_if_the_model_allows_one(
+    site: SimulationSite,
+) -> None:
+    form = site.client.get(site.page).text
     assert '<option value="simc PI" selected>' in form
     gain, integral_time = (
         float(re.search(rf'name="{name}" value="([^"]*)"', form)[1])  # type: ignore[index]
@@ -193,25 +197,25 @@ def test_the_form_suggests_the_controller_of_a_rule_if_the_model_allows_one(plac
     assert suggest_controller(load_model("narx"), {}, "u", "y") is None
 
 
-def test_the_figure_begins_near_the_step_and_the_table_at_the_start(place: Place) -> None:
+def test_the_figure_begins_near_the_step_and_the_table_at_the_start(site: SimulationSite) -> None:
     query = "gain=0.5&time=20&duration=40&sample_time=0.1"
-    text = place.client.get(f"{place.page}?{query}").text
+    text = site.client.get(f"{site.page}?{query}").text
     figure = re.search(r'id="figure-simulation">(.*?)</script>', text, re.DOTALL)
     assert figure is not None
     starts = [trace["x"][0] for trace in json.loads(figure.group(1))["data"]]
     assert starts == pytest.approx(len(starts) * [18])
-    table = place.client.get(f"{place.page}?{query}&format=csv").text
+    table = site.client.get(f"{site.page}?{query}&format=csv").text
     assert next(line for line in table.splitlines() if line.startswith("y,")).startswith("y,0.0,")
 
 
-def test_the_suggested_step_comes_once_the_loop_rests(place: Place) -> None:
-    form = place.client.get(place.page).text
+def test_the_suggested_step_comes_once_the_loop_rests(site: SimulationSite) -> None:
+    form = site.client.get(site.page).text
     names = "offset|amplitude|time|duration|sample_time"
     query = dict(re.findall(rf'name="({names})" value="([^"]*)"', form), tuning="simc PI")
-    shown = place.client.get(place.page, params=query).text
+    shown = site.client.get(site.page, params=query).text
     assert "Overshoot" in shown
     assert "the step metrics include its settling" not in shown
-    early = place.client.get(place.page, params={**query, "time": "0"}).text
+    early = site.client.get(site.page, params={**query, "time": "0"}).text
     assert "the step metrics include its settling" in early
 
 
@@ -232,9 +236,9 @@ def test_the_gain_has_the_unit_that_makes_an_input_of_an_output(
     assert _FormContext.gain_unit.fget(known) == unit  # type: ignore[attr-defined]
 
 
-def test_a_loop_of_small_gain_settles_and_the_page_says_by_how_much(place: Place) -> None:
+def test_a_loop_of_small_gain_settles_and_the_page_says_by_how_much(site: SimulationSite) -> None:
     query = "?kind=loop&gain=0.5&amplitude=1&duration=30&sample_time=0.05"
-    answer = place.client.get(place.page + query)
+    answer = site.client.get(site.page + query)
     assert answer.status_code == 200
     assert "✓" not in answer.text  # the sign comes with the sheet
     assert '<span class="verdict passed">settles</span>' in answer.text
@@ -243,29 +247,33 @@ def test_a_loop_of_small_gain_settles_and_the_page_says_by_how_much(place: Place
     assert "figure-simulation" in answer.text
 
 
-def test_a_loop_of_large_gain_runs_away_and_the_page_says_so(place: Place) -> None:
+def test_a_loop_of_large_gain_runs_away_and_the_page_says_so(site: SimulationSite) -> None:
     query = "?kind=loop&gain=5&amplitude=1&duration=40&sample_time=0.05"
-    answer = place.client.get(place.page + query)
+    answer = site.client.get(site.page + query)
     assert '<span class="verdict failed">diverges</span>' in answer.text
 
 
-def test_a_loop_that_is_cut_short_does_not_settle(place: Place) -> None:
+def test_a_loop_that_is_cut_short_does_not_settle(site: SimulationSite) -> None:
     query = "?kind=loop&gain=1&amplitude=1&duration=2&sample_time=0.05"
-    answer = place.client.get(place.page + query)
+    answer = site.client.get(site.page + query)
     assert '<span class="verdict apart">does not settle</span>' in answer.text
 
 
-def test_the_page_of_a_free_run_tells_the_agreement_of_the_rest_interface(place: Place) -> None:
-    answer = place.client.get(f"{place.page}?kind=recording&dataset={place.faster}")
-    fit = validated(place, dataset=place.faster).json()["fit_percent"]
+def test_the_page_of_a_free_run_tells_the_agreement_of_the_rest_interface(
+    site: SimulationSite,
+) -> None:
+    answer = site.client.get(f"{site.page}?kind=recording&dataset={site.faster}")
+    fit = validate_run(site, dataset=site.faster).json()["fit_percent"]
     assert f"{fit:.2f} %" in answer.text
-    assert f'<option value="{place.faster}" selected>faster</option>' in answer.text
+    assert f'<option value="{site.faster}" selected>faster</option>' in answer.text
 
 
-def test_a_signal_is_given_as_an_expression_and_its_numbers_come_as_csv(place: Place) -> None:
+def test_a_signal_is_given_as_an_expression_and_its_numbers_come_as_csv(
+    site: SimulationSite,
+) -> None:
     query = "?kind=signal&input.u=1%2B0*t&duration=20&sample_time=0.1"
-    assert "figure-simulation" in place.client.get(place.page + query).text
-    table = place.client.get(f"{place.page}{query}&format=csv")
+    assert "figure-simulation" in site.client.get(site.page + query).text
+    table = site.client.get(f"{site.page}{query}&format=csv")
     assert table.headers["content-type"].startswith("text/csv")
     last = [line for line in table.text.splitlines() if line.startswith("y,")][-1].split(",")
     assert float(last[1]) == 20
@@ -282,9 +290,9 @@ def curl_of(text: str) -> dict[str, Any]:
     return dict(json.loads(html.unescape(found.group(1))))
 
 
-def test_a_pi_controller_with_limits_is_simulated_as_by_rest(place: Place) -> None:
+def test_a_pi_controller_with_limits_is_simulated_as_by_rest(site: SimulationSite) -> None:
     query = "gain=0.6&integral_time=1.1&lower=0&upper=0.65&setpoint_weight=0.8&derivative_on=error"
-    text = place.client.get(f"{place.page}?{LOOP}&{query}").text
+    text = site.client.get(f"{site.page}?{LOOP}&{query}").text
     body = curl_of(text)
     assert body["control"] | {"reference": None} == {
         "input": "u",
@@ -297,7 +305,7 @@ def test_a_pi_controller_with_limits_is_simulated_as_by_rest(place: Place) -> No
         "derivative_on": "error",
         "reference": None,
     }
-    told = place.client.post(f"/v1/runs/{place.run}:simulate", json=body).json()
+    told = site.client.post(f"/v1/runs/{site.run}:simulate", json=body).json()
     margins, used = told["margins"], told["controller"]
     shown = {
         "Gain margin": f"{margins['gain_margin']:.2f}",
@@ -309,15 +317,15 @@ def test_a_pi_controller_with_limits_is_simulated_as_by_rest(place: Place) -> No
     assert re.search(r'"y0":0\.65,"y1":0\.65', text)  # the limit in the figure
 
 
-def test_a_decimal_comma_is_read(place: Place) -> None:
+def test_a_decimal_comma_is_read(site: SimulationSite) -> None:
     query = "gain=0,6&integral_time=1,25e0&lower=-,5&upper=1000,5"
-    control = curl_of(place.client.get(f"{place.page}?{LOOP}&{query}").text)["control"]
+    control = curl_of(site.client.get(f"{site.page}?{LOOP}&{query}").text)["control"]
     names = "gain", "integral_time", "lower", "upper"
     assert [control[name] for name in names] == [0.6, 1.25, -0.5, 1000.5]
 
 
-def test_a_rule_fills_in_the_numbers_that_it_chose(place: Place) -> None:
-    text = place.client.get(f"{place.page}?{LOOP}&gain=7&tuning=simc+PI").text
+def test_a_rule_fills_in_the_numbers_that_it_chose(site: SimulationSite) -> None:
+    text = site.client.get(f"{site.page}?{LOOP}&gain=7&tuning=simc+PI").text
     body = curl_of(text)
     assert body["control"]["tuning"] == {"rule": "simc", "controller": "PI"}
     assert "gain" not in body["control"]
@@ -325,15 +333,13 @@ def test_a_rule_fills_in_the_numbers_that_it_chose(place: Place) -> None:
     assert re.search(r'name="integral_time" value="(1|0\.9999|1\.000)', text)
     assert "Skogestad" in text
     assert "Controller by SIMC" in text
-    slower = place.client.get(
-        f"{place.page}?{LOOP}&tuning=simc+PID&closed_loop_time_constant=2"
-    ).text
+    slower = site.client.get(f"{site.page}?{LOOP}&tuning=simc+PID&closed_loop_time_constant=2").text
     assert curl_of(slower)["control"]["tuning"]["closed_loop_time_constant"] == 2.0
     assert "no second time constant" in slower
 
 
-def test_a_limit_cycle_is_no_settling_time(place: Place) -> None:
-    text = place.client.get(f"{place.page}?{LOOP}&gain=5&integral_time=2&limit=1.5").text
+def test_a_limit_cycle_is_no_settling_time(site: SimulationSite) -> None:
+    text = site.client.get(f"{site.page}?{LOOP}&gain=5&integral_time=2&limit=1.5").text
     assert "keeps oscillating" in text
     assert "oscillates and does not settle" in text
     assert "<dd>unstable</dd>" in text
@@ -377,9 +383,9 @@ def test_a_limit_cycle_is_no_settling_time(place: Place) -> None:
     ],
 )
 def test_a_wrong_input_is_answered_on_the_page_by_one_line(
-    place: Place, query: str, line: str
+    site: SimulationSite, query: str, line: str
 ) -> None:
-    answer = place.client.get(f"{place.page}?{query}")
+    answer = site.client.get(f"{site.page}?{query}")
     assert answer.status_code == 422
     assert answer.headers["content-type"].startswith("text/html")
     [told] = re.findall(r'role="alert"><b>The simulation failed:</b>(.*?)</div>', answer.text)
@@ -388,19 +394,19 @@ def test_a_wrong_input_is_answered_on_the_page_by_one_line(
     assert "figure-simulation" not in answer.text
 
 
-def test_several_wrong_inputs_are_told_together_each_at_its_field(place: Place) -> None:
-    text = place.client.get(f"{place.page}?gain=a&limit=b&duration=5&sample_time=0.1").text
+def test_several_wrong_inputs_are_told_together_each_at_its_field(site: SimulationSite) -> None:
+    text = site.client.get(f"{site.page}?gain=a&limit=b&duration=5&sample_time=0.1").text
     assert text.count('aria-invalid="true"') == 2
     assert text.count("<li>") == 2
 
 
-def test_what_is_typed_is_escaped(place: Place) -> None:
-    text = place.client.get(f"{place.page}?gain=%22%3E%3Cscript%3E&duration=5&sample_time=1").text
+def test_what_is_typed_is_escaped(site: SimulationSite) -> None:
+    text = site.client.get(f"{site.page}?gain=%22%3E%3Cscript%3E&duration=5&sample_time=1").text
     assert "<script>" not in text
 
 
-def test_a_run_that_is_not_there_is_not_found(place: Place) -> None:
-    assert place.client.get("/runs/run_x/simulate").status_code == 404
+def test_a_run_that_is_not_there_is_not_found(site: SimulationSite) -> None:
+    assert site.client.get("/runs/run_x/simulate").status_code == 404
 
 
 def test_a_run_without_estimates_says_so(tmp_path: Path) -> None:
@@ -413,7 +419,7 @@ def test_a_run_without_estimates_says_so(tmp_path: Path) -> None:
 
 
 def test_while_too_many_simulate_the_others_are_asked_to_come_again_and_nothing_else_waits(
-    place: Place,
+    site: SimulationSite,
 ) -> None:
     step = {"inputs": {"u": {"kind": "step"}}, "samples": 50, "sample_time": 0.1}
     query = {"kind": "loop", "gain": "1", "duration": "5", "sample_time": "0.1"}
@@ -425,13 +431,13 @@ def test_while_too_many_simulate_the_others_are_asked_to_come_again_and_nothing_
             assert simulation_limit._admitted.acquire(blocking=False)  # none is free
             others.callback(simulation_limit._admitted.release)
         for answer in (
-            place.client.post(f"/v1/runs/{place.run}:simulate", json=step),
-            place.client.post("/v1/datasets:simulate", json=made),
-            validated(place, dataset=place.other),
+            site.client.post(f"/v1/runs/{site.run}:simulate", json=step),
+            site.client.post("/v1/datasets:simulate", json=made),
+            validate_run(site, dataset=site.other),
         ):
-            refused(answer, 503, "unavailable")
+            read_faults(answer, 503, "unavailable")
             assert answer.headers["retry-after"] == "2"
-        page = place.client.get(place.page, params=query)
+        page = site.client.get(site.page, params=query)
         assert (page.status_code, "ask again" in page.text) == (503, True)
-        assert place.client.get(place.page).status_code == 200
-    assert place.client.get(place.page, params=query).status_code == 200
+        assert site.client.get(site.page).status_code == 200
+    assert site.client.get(site.page, params=query).status_code == 200

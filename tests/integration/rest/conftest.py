@@ -7,8 +7,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
-from tests.batches import ServedBatch, serve_batch
-from tests.rest import recording, settings_of, store_csv
+from tests.support.service.tube_batch import ServedBatch, serve_batch
+from tests.support.service.web_app import recording, settings_of, store_csv
 
 
 @pytest.fixture(scope="module")

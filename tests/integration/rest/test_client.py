@@ -10,23 +10,9 @@ from starlette.testclient import TestClient
 from service.client.async_client import AsyncClient
 from service.client.calls import NotFinite, ProblemError, ServerUnreachable, call
 from service.client.client import Client
-from tests.rest import awaited, recording
+from tests.support.service.web_app import Through, await_in_thread, recording
 
 MANY = {"axes": [{"path": "/seed", "range": [0, 600]}]}
-
-
-class Through(httpx.BaseTransport):
-    """Sends a client's requests to an application of this process."""
-
-    def __init__(self, server: TestClient) -> None:
-        self._server = server
-
-    def handle_request(self, request: httpx.Request) -> httpx.Response:
-        answer = self._server.request(
-            request.method, str(request.url), content=request.read(), headers=dict(request.headers)
-        )
-        headers = [(k, v) for k, v in answer.headers.items() if k != "content-encoding"]
-        return httpx.Response(answer.status_code, headers=headers, content=answer.content)
 
 
 @pytest.fixture
@@ -143,7 +129,7 @@ def test_the_asynchronous_client_does_the_same(server: TestClient, dataset: str)
             summary = await client.summary(twins[0]["id"], by=["/noise/sigma"])
             assert [group["runs"] for group in summary["groups"]] == [6, 6]
 
-    awaited(work)
+    await_in_thread(work)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])

@@ -10,7 +10,7 @@ from service.core.errors import ServiceError
 ONLY_OF_COMMANDS = {errors.Misconfigured, errors.ServiceDidNotStart}
 
 
-def answered_over_http() -> list[type[ServiceError]]:
+def list_http_errors() -> list[type[ServiceError]]:
     """The errors that a request can meet; those of commands alone have no page."""
     named = [value for value in vars(errors).values() if isinstance(value, type)]
     return [
@@ -23,7 +23,7 @@ def answered_over_http() -> list[type[ServiceError]]:
 
 
 def test_every_kind_of_problem_is_explained(server: TestClient) -> None:
-    kinds = {error.kind for error in answered_over_http()} | set(STATUS_KINDS.values())
+    kinds = {error.kind for error in list_http_errors()} | set(STATUS_KINDS.values())
     assert kinds | {"internal", "invalid-upload"} == set(PROBLEM_KINDS)
     for kind in kinds:
         assert server.get(f"/problems/{kind}").text == PROBLEM_KINDS[kind]

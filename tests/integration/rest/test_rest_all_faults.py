@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from tests.rest import refused, store_csv
+from tests.support.service.web_app import read_faults, store_csv
 
 SWEEP = {"sigma": [0.1], "replicates": 2}
 TRUTH = {
@@ -26,8 +26,8 @@ TWO_OUTPUTS = {
 }
 
 
-def faults(answer: Any) -> dict[str, str]:
-    return {one["pointer"]: one["detail"] for one in refused(answer, 422, "invalid")}
+def list_faults(answer: Any) -> dict[str, str]:
+    return {one["pointer"]: one["detail"] for one in read_faults(answer, 422, "invalid")}
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_a_job_with_faults_of_types_is_told_all_of_these_and_no_others(
     server: TestClient, dataset: str, changes: dict[str, Any], pointers: set[str]
 ) -> None:
     body = {"model": "fopdt", "datasets": [dataset], **changes}
-    assert set(faults(server.post("/v1/jobs", json=body))) == pointers
+    assert set(list_faults(server.post("/v1/jobs", json=body))) == pointers
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_a_job_of_right_types_is_told_all_its_faults_and_none_that_follows_from_
     server: TestClient, dataset: str, changes: dict[str, Any], pointers: set[str]
 ) -> None:
     body = {"model": "fopdt", "datasets": [dataset], **changes}
-    assert set(faults(server.post("/v1/jobs", json=body))) == pointers
+    assert set(list_faults(server.post("/v1/jobs", json=body))) == pointers
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_a_noise_sweep_is_told_its_faults_of_types_else_all_others(
     body = {**SWEEP, "model": "fopdt", **changes}
     if "datasets" in changes:
         body["datasets"] = [dataset]
-    assert set(faults(server.post("/v1/recipes/noise-sweep", json=body))) == pointers
+    assert set(list_faults(server.post("/v1/recipes/noise-sweep", json=body))) == pointers
 
 
 def test_faults_of_a_model_document_in_a_noise_sweep_are_told_once_at_the_model(
@@ -145,7 +145,7 @@ def test_faults_of_a_model_document_in_a_noise_sweep_are_told_once_at_the_model(
     wrong = {**TWO_OUTPUTS, "equations": {"x": "(u - z)/T"}}
     body = {**SWEEP, "model": wrong, "truth": TRUTH}
     answer = server.post("/v1/recipes/noise-sweep", json=body)
-    assert [one["pointer"] for one in refused(answer, 422, "invalid")] == ["/model/equations/x"]
+    assert [one["pointer"] for one in read_faults(answer, 422, "invalid")] == ["/model/equations/x"]
 
 
 def test_units_and_missing_channels_are_told_in_one_answer(server: TestClient) -> None:
@@ -161,12 +161,12 @@ def test_units_and_missing_channels_are_told_in_one_answer(server: TestClient) -
         "outputs": {"y": "x"},
     }
     body = {"model": own, "datasets": [name]}
-    found = faults(server.post("/v1/jobs", json=body))
+    found = list_faults(server.post("/v1/jobs", json=body))
     assert set(found) == {"/channels", "/datasets/0"}
     assert "no channel 'y'" in found["/channels"]
     assert "'u' is in V" in found["/datasets/0"]
     batch = {"model": own, "label": "n", "batch": [{"x": 1, "datasets": [name]}]}
-    assert set(faults(server.post("/v1/recipes/reidentify", json=batch))) >= {"/channels"}
+    assert set(list_faults(server.post("/v1/recipes/reidentify", json=batch))) >= {"/channels"}
 
 
 def test_a_batch_is_told_its_faults_of_types_else_all_others(
@@ -174,9 +174,9 @@ def test_a_batch_is_told_its_faults_of_types_else_all_others(
 ) -> None:
     batch = [{"x": 5, "datasets": [dataset]}]
     body = {"model": "fopdt", "label": "n", "batch": batch, "trend_parameters": ["LL"], "seed": "x"}
-    assert set(faults(server.post("/v1/recipes/reidentify", json=body))) == {"/seed"}
+    assert set(list_faults(server.post("/v1/recipes/reidentify", json=body))) == {"/seed"}
     body = {"model": "fopdt", "batch": 3, "trend_parameters": ["LL"], "warm_start": "reference"}
-    found = faults(server.post("/v1/recipes/reidentify", json=body))
+    found = list_faults(server.post("/v1/recipes/reidentify", json=body))
     assert set(found) == {"/label", "/batch"}
     body = {
         "model": "fopdt",
@@ -186,7 +186,7 @@ def test_a_batch_is_told_its_faults_of_types_else_all_others(
         "trend_parameters": ["LL"],
         "parameters": {"LL": {"upper": 1}},
     }
-    found = faults(server.post("/v1/recipes/reidentify", json=body))
+    found = list_faults(server.post("/v1/recipes/reidentify", json=body))
     assert set(found) == {"/warm_start", "/trend_parameters/0", "/parameters/LL"}
 
 
@@ -207,7 +207,7 @@ def test_a_body_that_is_nested_too_deeply_is_refused_wherever_that_is(
     for depth, field in product((60, 600, 960, 990), ("model", "parameters", "sweep", "unknown")):
         body = f'{{"datasets": ["d"], {others} "{field}": {start * depth}1{end * depth}}}'
         answer = server.post(path, content=body, headers={"content-type": "application/json"})
-        assert refused(answer, 422, "invalid")
+        assert read_faults(answer, 422, "invalid")
 
 
 def test_of_very_many_unknown_fields_the_first_are_told_and_how_many_more_there_are(
@@ -215,7 +215,7 @@ def test_of_very_many_unknown_fields_the_first_are_told_and_how_many_more_there_
 ) -> None:
     many = {f"x{number}": 1 for number in range(2500)}
     answer = server.post("/v1/jobs", json={"model": "fopdt", "datasets": [dataset], **many})
-    found = refused(answer, 422, "invalid")
+    found = read_faults(answer, 422, "invalid")
     assert len(found) == 1001
     assert found[-1] == {"pointer": "", "detail": "1500 more faults are not listed"}
 
@@ -226,4 +226,4 @@ def test_a_header_that_cannot_be_used_is_told_with_the_faults_of_types(
 ) -> None:
     body = {"model": "fopdt", "datasets": [dataset], "parameters": {"LL": {"upper": 1}}, **changes}
     answer = server.post("/v1/jobs", json=body, headers={"Idempotency-Key": "k" * 201})
-    assert set(faults(answer)) == {"?idempotency-key", *(f"/{name}" for name in changes)}
+    assert set(list_faults(answer)) == {"?idempotency-key", *(f"/{name}" for name in changes)}

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
-from tests.profiles import scale_examples
+from tests.support.profiles import scale_examples
 
 TRUTH = {
     "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0},
@@ -119,7 +119,7 @@ def places(node: Any, here: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
             yield from places(value, (*here, key))
 
 
-def changed(body: dict[str, Any], place: tuple[Any, ...], value: Any) -> dict[str, Any]:
+def change_value(body: dict[str, Any], place: tuple[Any, ...], value: Any) -> dict[str, Any]:
     """The body with another value at a place."""
     made = deepcopy(body)
     holder: Any = made
@@ -138,7 +138,7 @@ def test_any_value_anywhere_is_taken_or_refused_with_a_sentence(
     made = body
     for _ in range(data.draw(st.integers(1, 2))):
         known = [*places(made), ("another",)]
-        made = changed(made, data.draw(st.sampled_from(known)), data.draw(VALUES))
+        made = change_value(made, data.draw(st.sampled_from(known)), data.draw(VALUES))
     answer = server.post(
         path.format(dataset=dataset),
         content=json.dumps(made),

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from tests.rest import CSV, recording, refused, store_csv
+from tests.support.service.web_app import CSV, read_faults, recording, store_csv
 
 MODEL: dict[str, Any] = {
     "name": "own",
@@ -82,7 +82,7 @@ def test_a_job_that_cannot_be_used_is_refused_with_the_place_and_what_was_found(
     server: TestClient, dataset: str, changes: dict[str, Any], pointer: str, words: str
 ) -> None:
     answer = server.post("/v1/jobs", json=with_changes(dataset, changes))
-    faults = refused(answer, 422, "invalid")
+    faults = read_faults(answer, 422, "invalid")
     assert [fault for fault in faults if fault["pointer"] == pointer and words in fault["detail"]]
 
 
@@ -115,7 +115,7 @@ def test_a_sweep_that_cannot_be_expanded_is_refused_at_its_axis(
     server: TestClient, dataset: str, axis: dict[str, Any], place: str, words: str
 ) -> None:
     body = with_changes(dataset, {"sweep": {"axes": [axis]}})
-    faults = refused(server.post("/v1/jobs", json=body), 422, "invalid")
+    faults = read_faults(server.post("/v1/jobs", json=body), 422, "invalid")
     pointer = "/sweep/axes" if place == "axes" else f"/sweep/axes/0/{place}".rstrip("/")
     assert [fault for fault in faults if fault["pointer"] == pointer and words in fault["detail"]]
 
@@ -147,9 +147,9 @@ def test_a_model_with_a_fault_is_refused_with_its_column(
     assert fault["pointer"].startswith(pointer)
     assert fault["column"] == column
     assert words in fault["detail"]
-    refused(server.post("/v1/models", json=document), 422, "invalid")
+    read_faults(server.post("/v1/models", json=document), 422, "invalid")
     answer = server.post("/v1/jobs", json={"model": document, "datasets": [dataset]})
-    assert refused(answer, 422, "invalid")[0]["pointer"].startswith(f"/model{pointer}")
+    assert read_faults(answer, 422, "invalid")[0]["pointer"].startswith(f"/model{pointer}")
 
 
 @pytest.mark.parametrize("text", [b"{", b"[1,2]", b'{"a": NaN}', b"\xff\xfe", b"null"])
@@ -164,13 +164,13 @@ def test_the_check_of_a_model_answers_whatever_is_sent(server: TestClient, text:
 
 def test_an_own_model_cannot_take_the_name_of_a_built_in_one(server: TestClient) -> None:
     answer = server.post("/v1/models", json={**MODEL, "name": "tube"})
-    assert refused(answer, 422, "invalid")[0]["pointer"] == "/name"
+    assert read_faults(answer, 422, "invalid")[0]["pointer"] == "/name"
 
 
 def test_a_name_under_which_a_model_could_not_be_read_is_refused(server: TestClient) -> None:
     for name in ("a/b", "a@1", ".", "a?b", "a b"):
         answer = server.post("/v1/models", json={**MODEL, "name": name})
-        assert refused(answer, 422, "invalid")[0]["pointer"] == "/name"
+        assert read_faults(answer, 422, "invalid")[0]["pointer"] == "/name"
 
 
 def test_a_model_can_be_read_under_every_name_that_it_may_have(server: TestClient) -> None:
@@ -195,7 +195,7 @@ def test_pages_of_models_have_each_once_and_the_built_in_ones_first(own: TestCli
 
 def test_a_csv_that_cannot_be_read_is_refused_with_its_row(server: TestClient) -> None:
     answer = server.post("/v1/datasets", content=b"t,u,y\n0,1,2\n0.1,volt,3\n", headers=CSV)
-    refused(answer, 422, "invalid-upload")
+    read_faults(answer, 422, "invalid-upload")
     assert "row 3, column 'u'" in answer.json()["detail"]
 
 
@@ -205,25 +205,25 @@ def test_a_damaged_mcap_is_refused(server: TestClient, dataset: str) -> None:
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 0x10
     answer = server.post("/v1/datasets", content=bytes(flipped), headers=kind)
-    refused(answer, 422, "invalid-upload")
+    read_faults(answer, 422, "invalid-upload")
 
 
 def test_an_upload_of_another_kind_is_refused(server: TestClient) -> None:
     answer = server.post("/v1/datasets", content=b"x", headers={"content-type": "image/png"})
-    refused(answer, 415, "unsupported-media-type")
+    read_faults(answer, 415, "unsupported-media-type")
     assert "'image/png'" in answer.json()["detail"]
 
 
 def test_an_upload_over_the_limit_is_refused(server: TestClient) -> None:
     large = b"t,u,y\n" + b"0,0,0\n" * 60_000
-    refused(server.post("/v1/datasets", content=large, headers=CSV), 413, "too-large")
+    read_faults(server.post("/v1/datasets", content=large, headers=CSV), 413, "too-large")
     pieces = (large[i : i + 1000] for i in range(0, len(large), 1000))
-    refused(server.post("/v1/datasets", content=pieces, headers=CSV), 413, "too-large")
+    read_faults(server.post("/v1/datasets", content=pieces, headers=CSV), 413, "too-large")
 
 
 def test_a_form_without_a_file_is_refused(server: TestClient) -> None:
     answer = server.post("/v1/datasets", files={"note": (None, "text")})
-    assert refused(answer, 422, "invalid")[0]["pointer"] == "/file"
+    assert read_faults(answer, 422, "invalid")[0]["pointer"] == "/file"
 
 
 SIMULATIONS: list[tuple[dict[str, Any], str, str]] = [
@@ -246,7 +246,7 @@ def test_a_simulation_that_cannot_be_done_is_refused(
         "sample_time": 0.1,
         **changes,
     }
-    faults = refused(server.post("/v1/datasets:simulate", json=body), 422, "invalid")
+    faults = read_faults(server.post("/v1/datasets:simulate", json=body), 422, "invalid")
     assert [fault for fault in faults if fault["pointer"] == pointer and words in fault["detail"]]
 
 
@@ -255,13 +255,13 @@ def test_a_derivation_that_cannot_be_done_is_refused_at_its_step(
 ) -> None:
     steps = [{"detrend": {}}, {"noise": {"sigma": -1, "channels": ["y"]}}]
     answer = server.post(f"/v1/datasets/{dataset}:derive", json={"steps": steps})
-    assert refused(answer, 422, "invalid")[0]["pointer"] == "/steps/1/noise/sigma"
+    assert read_faults(answer, 422, "invalid")[0]["pointer"] == "/steps/1/noise/sigma"
 
 
 def test_a_body_that_is_not_json_is_refused(server: TestClient) -> None:
     json_type = {"content-type": "application/json"}
     answer = server.post("/v1/jobs", content=b'{"model": ', headers=json_type)
-    assert "not JSON" in refused(answer, 422, "invalid")[0]["detail"]
+    assert "not JSON" in read_faults(answer, 422, "invalid")[0]["detail"]
     assert answer.json()["detail"].startswith("the body is not JSON")  # and no empty place
 
 
@@ -271,7 +271,7 @@ def test_a_fault_of_json_has_its_line_and_column(server: TestClient) -> None:
         content=b'{\n "model": "fopdt",\n "datasets": x\n}',
         headers={"content-type": "application/json"},
     )
-    (fault,) = refused(answer, 422, "invalid")
+    (fault,) = read_faults(answer, 422, "invalid")
     assert fault["detail"] == "the body is not JSON: line 3, column 14: Expecting value"
 
 
@@ -287,7 +287,7 @@ def test_a_body_that_no_json_reader_takes_is_refused_with_the_reason(
     server: TestClient, text: bytes, words: str
 ) -> None:
     answer = server.post("/v1/jobs", content=text, headers={"content-type": "application/json"})
-    assert words in refused(answer, 422, "invalid")[0]["detail"]
+    assert words in read_faults(answer, 422, "invalid")[0]["detail"]
 
 
 def test_a_recording_is_not_taken_twice(server: TestClient, dataset: str) -> None:
@@ -296,7 +296,7 @@ def test_a_recording_is_not_taken_twice(server: TestClient, dataset: str) -> Non
         ({"validation": {"datasets": [dataset]}}, "/validation/datasets/0"),
     ):
         answer = server.post("/v1/jobs", json=with_changes(dataset, changes))
-        fault = refused(answer, 422, "invalid")[0]
+        fault = read_faults(answer, 422, "invalid")[0]
         assert fault["pointer"] == pointer
         assert "same recording" in fault["detail"]
 
@@ -310,7 +310,8 @@ def test_a_fixed_start_is_no_free_parameter_and_an_estimated_one_is(
     assert server.post("/v1/jobs", json=body).status_code == 202
     body["parameters"] = {**fixed, "x(0)": {"fixed": 0}}
     assert (
-        refused(server.post("/v1/jobs", json=body), 422, "invalid")[0]["pointer"] == "/parameters"
+        read_faults(server.post("/v1/jobs", json=body), 422, "invalid")[0]["pointer"]
+        == "/parameters"
     )
 
 
@@ -322,7 +323,7 @@ def test_a_population_that_no_memory_holds_is_refused(server: TestClient, datase
         "equations": {"x": " + ".join(names) + " + u"},
     }
     body = {"model": model, "datasets": [dataset], "algorithm": {"population": 100_000}}
-    fault = refused(server.post("/v1/jobs", json=body), 422, "invalid")[0]
+    fault = read_faults(server.post("/v1/jobs", json=body), 422, "invalid")[0]
     assert fault["pointer"] == "/algorithm/population"
     assert "At most 99009" in fault["detail"]
 
@@ -338,19 +339,19 @@ def test_a_population_that_no_memory_holds_is_refused(server: TestClient, datase
 def test_a_query_value_that_cannot_be_used_is_named(
     server: TestClient, query: str, pointer: str
 ) -> None:
-    faults = refused(server.get(f"/v1/jobs?{query}"), 422, "invalid")
+    faults = read_faults(server.get(f"/v1/jobs?{query}"), 422, "invalid")
     assert faults[0]["pointer"] == pointer
 
 
 def test_a_text_that_no_database_can_keep_is_refused(server: TestClient, dataset: str) -> None:
     body = with_changes(dataset, {"name": "nul \x00"})
-    refused(server.post("/v1/jobs", json=body), 422, "invalid")
+    read_faults(server.post("/v1/jobs", json=body), 422, "invalid")
 
 
 def test_an_unknown_channel_names_those_that_are_there(own: TestClient) -> None:
     stored = store_csv(own, recording(columns=("P1", "P2")))
     body = {"model": "fopdt", "datasets": [stored]}
-    faults = refused(own.post("/v1/jobs", json=body), 422, "invalid")
+    faults = read_faults(own.post("/v1/jobs", json=body), 422, "invalid")
     assert faults[0]["pointer"] == "/channels"
     assert "P1, P2" in faults[0]["detail"]
 
@@ -358,30 +359,34 @@ def test_an_unknown_channel_names_those_that_are_there(own: TestClient) -> None:
 def test_an_output_that_is_its_own_input_is_refused(own: TestClient) -> None:
     stored = store_csv(own, recording(columns=("P1", "P2")))
     body = {"model": "fopdt", "datasets": [stored], "channels": {"u": "P2", "y": "P2"}}
-    [fault] = refused(own.post("/v1/jobs", json=body), 422, "invalid")
+    [fault] = read_faults(own.post("/v1/jobs", json=body), 422, "invalid")
     assert fault["pointer"] == "/channels/u"
     assert "both input 'u' and output 'y'" in fault["detail"]
 
 
 def test_validation_data_in_other_units_or_with_other_channels_are_refused(own: TestClient) -> None:
-    def stored(columns: str) -> str:
+    def store_columns(columns: str) -> str:
         text = recording().decode().replace("t,u,y", columns)
         return store_csv(own, text.encode(), f"{len(columns)}")
 
-    fitted, other, alien = stored("t,u [V],y [m]"), stored("t,u [V],y [mm]"), stored("t,u,z")
+    fitted, other, alien = (
+        store_columns("t,u [V],y [m]"),
+        store_columns("t,u [V],y [mm]"),
+        store_columns("t,u,z"),
+    )
     body = {"model": "fopdt", "datasets": [fitted], "validation": {"datasets": [other]}}
-    fault = refused(own.post("/v1/jobs", json=body), 422, "invalid")[0]
+    fault = read_faults(own.post("/v1/jobs", json=body), 422, "invalid")[0]
     assert fault["pointer"] == "/validation/datasets/0"
     assert "channel 'y' is in mm" in fault["detail"]
     body["validation"] = {"datasets": [alien]}
-    fault = refused(own.post("/v1/jobs", json=body), 422, "invalid")[0]
+    fault = read_faults(own.post("/v1/jobs", json=body), 422, "invalid")[0]
     assert "has no channel 'y'" in fault["detail"]
     pooled = {"model": "fopdt", "datasets": [fitted, other]}
-    fault = refused(own.post("/v1/jobs", json=pooled), 422, "invalid")[0]
+    fault = read_faults(own.post("/v1/jobs", json=pooled), 422, "invalid")[0]
     assert fault["pointer"] == "/datasets/1"
     assert "1 mm is 0.001 m" in fault["detail"]
     declared = {"model": "duffing-delay", "datasets": [fitted], "channels": {"q": "u"}}
-    fault = refused(own.post("/v1/jobs", json=declared), 422, "invalid")[0]
+    fault = read_faults(own.post("/v1/jobs", json=declared), 422, "invalid")[0]
     assert fault["pointer"] == "/datasets/0"
     assert "channel 'u' (signal 'q')" in fault["detail"]
     assert "but in model 'duffing-delay' it is in N" in fault["detail"]

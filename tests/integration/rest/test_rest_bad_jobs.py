@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 from service.api.app import create_app
 from service.api.dependencies import Parts
 from service.cli.main import build_program
-from tests.identified import identified
-from tests.rest import recording, refused, settings_of, store_csv
+from tests.support.service.local_runs import identify_job
+from tests.support.service.web_app import read_faults, recording, settings_of, store_csv
 
 SMALL = {"population": 20, "generations": 20, "islands": 1}
 FIRST: dict[str, Any] = {
@@ -45,11 +45,11 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TestClient
         yield client, app.state.parts
 
 
-def ended(parts: tuple[TestClient, Parts], content: bytes, **fields: Any) -> dict[str, Any]:
+def identify_on(parts: tuple[TestClient, Parts], content: bytes, **fields: Any) -> dict[str, Any]:
     """The one run of a job on that recording, carried out."""
     client, inside = parts
     body = {"model": FIRST, "datasets": [store_csv(client, content)], "algorithm": SMALL, **fields}
-    _, (run,) = identified(inside, body)
+    _, (run,) = identify_job(inside, body)
     answer = client.get(f"/v1/runs/{run}")
     assert answer.status_code == 200, answer.text
     return dict(answer.json())
@@ -62,16 +62,18 @@ def test_a_delay_in_another_unit_is_refused_to_a_job_and_to_the_store(
     delay = {"lower": 0, "upper": 2, "unit": "min"}
     model = {**FIRST, "parameters": {**FIRST["parameters"], "L": delay}}
     said = "found 'min', but this delay is in seconds: give it in s, or write t - 60*L"
-    job = refused(client.post("/v1/jobs", json={"model": model, "datasets": ["r"]}), 422, "invalid")
+    job = read_faults(
+        client.post("/v1/jobs", json={"model": model, "datasets": ["r"]}), 422, "invalid"
+    )
     assert ("/model/parameters/L/unit", said) in [(one["pointer"], one["detail"]) for one in job]
-    [fault] = refused(client.post("/v1/models", json=model), 422, "invalid")
+    [fault] = read_faults(client.post("/v1/models", json=model), 422, "invalid")
     assert (fault["pointer"], fault["detail"]) == ("/parameters/L/unit", said)
 
 
 def test_an_input_that_is_zero_fails_the_run_with_one_line_that_says_why(
     parts: tuple[TestClient, Parts],
 ) -> None:
-    run = ended(parts, constant(u=0.0))
+    run = identify_on(parts, constant(u=0.0))
     assert run["state"] == "failed"
     assert "none of K, T, L has an effect on the output" in str(run["error"])
     assert "Traceback" not in str(run["error"])
@@ -80,7 +82,7 @@ def test_an_input_that_is_zero_fails_the_run_with_one_line_that_says_why(
 def test_an_input_that_is_constant_is_told_with_what_it_leaves_open(
     parts: tuple[TestClient, Parts],
 ) -> None:
-    run = ended(parts, constant(u=1.0), model="fopdt")
+    run = identify_on(parts, constant(u=1.0), model="fopdt")
     assert run["state"] == "succeeded"
     (text,) = (one for one in run["warnings"] if "excites nothing" in one)
     left = text.partition("unidentified: ")[2].split(", ")
@@ -92,7 +94,7 @@ def test_an_input_that_is_constant_is_told_with_what_it_leaves_open(
 def test_a_constant_output_is_fitted_and_the_fit_is_said_to_be_none(
     parts: tuple[TestClient, Parts],
 ) -> None:
-    run = ended(parts, constant(y=1.5))
+    run = identify_on(parts, constant(y=1.5))
     assert run["state"] == "succeeded"
     assert any("worse than a straight line" in one for one in run["warnings"])
 
@@ -141,7 +143,7 @@ def test_what_would_have_no_effect_is_refused_with_its_place(
         ({"model": FIRST, "weights": {"y": 2}}, "/weights/y", "a weight would change nothing"),
     ):
         answer = parts[0].post("/v1/jobs", json={**body, "datasets": [data]})
-        faults = refused(answer, 422, "invalid")
+        faults = read_faults(answer, 422, "invalid")
         assert [one for one in faults if one["pointer"] == pointer and words in one["detail"]], (
             faults
         )
@@ -159,11 +161,11 @@ def test_a_lag_that_the_record_has_no_room_for_is_refused_by_its_name(
         "datasets": [short],
         "parameters": {"L": {"upper": 5}},
     }
-    fault = refused(own.post("/v1/jobs", json=body), 422, "invalid")[0]
+    fault = read_faults(own.post("/v1/jobs", json=body), 422, "invalid")[0]
     assert fault["pointer"] == "/datasets/0"
     assert "lasts 3.9 s" in fault["detail"]
     assert "the upper bound of L is 5 s" in fault["detail"]
     assert "a smaller upper bound of L: below 3.9 s" in fault["detail"]
     body["parameters"] = {"L": {"fixed": 4.5}}
-    fault = refused(own.post("/v1/jobs", json=body), 422, "invalid")[0]
+    fault = read_faults(own.post("/v1/jobs", json=body), 422, "invalid")[0]
     assert "(L is 4.5 s); give a longer record, or a smaller L: below 3.9 s" in fault["detail"]

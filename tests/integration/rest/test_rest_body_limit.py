@@ -15,13 +15,13 @@ from service.api.app import create_app
 from service.api.middleware import BodyLimit
 from service.core.errors import InvalidRequest, TooLarge
 from service.core.settings import Settings
-from tests.rest import CSV, awaited, recording, refused, settings_of
+from tests.support.service.web_app import CSV, await_in_thread, read_faults, recording, settings_of
 
 LIMIT = 20_000
 
 
 @pytest.fixture(scope="module")
-def limited(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+def limited_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     settings = settings_of(tmp_path_factory.mktemp("limited"), max_body_bytes=LIMIT)
     with TestClient(create_app(settings), raise_server_exceptions=False) as client:
         yield client
@@ -41,22 +41,22 @@ JSON = {"content-type": "application/json"}
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize("is_chunked", [False, True])
 def test_a_body_over_the_limit_is_a_problem_document_that_tells_the_limit(
-    limited: TestClient, route: str, is_chunked: bool
+    limited_server: TestClient, route: str, is_chunked: bool
 ) -> None:
     pieces = [b"[", b" " * LIMIT, b"]"]
     content: Any = iter(pieces) if is_chunked else b"".join(pieces)
-    answer = limited.post(route, content=content, headers=JSON)
-    refused(answer, 413, "too-large")
+    answer = limited_server.post(route, content=content, headers=JSON)
+    read_faults(answer, 413, "too-large")
     assert str(LIMIT) in answer.json()["detail"]
     assert "LAGID_MAX_BODY_BYTES" in answer.json()["detail"]
 
 
-def test_a_body_within_the_limit_and_an_upload_are_read(limited: TestClient) -> None:
+def test_a_body_within_the_limit_and_an_upload_are_read(limited_server: TestClient) -> None:
     body = json.dumps({"model": "fopdt", "datasets": ["none"]}).encode().ljust(LIMIT)
-    refused(limited.post("/v1/jobs", content=body, headers=JSON), 422, "invalid")
+    read_faults(limited_server.post("/v1/jobs", content=body, headers=JSON), 422, "invalid")
     long = recording(3000)
     assert len(long) > LIMIT
-    assert limited.post("/v1/datasets", content=long, headers=CSV).status_code == 201
+    assert limited_server.post("/v1/datasets", content=long, headers=CSV).status_code == 201
 
 
 def read(headers: list[tuple[bytes, bytes]], pieces: int) -> int:
@@ -77,7 +77,7 @@ def read(headers: list[tuple[bytes, bytes]], pieces: int) -> int:
         with pytest.raises(TooLarge):
             await BodyLimit(application, 35)(scope, receive, receive)
 
-    awaited(play)
+    await_in_thread(play)
     return taken
 
 
@@ -114,7 +114,7 @@ def test_lengths_of_an_axis_are_bounded(own: TestClient, axis: Any, pointer: str
         "datasets": ["none"],
         "sweep": {"axes": [{"path": "/seed", "values": [1], **axis}]},
     }
-    faults = refused(own.post("/v1/jobs", json=body), 422, "invalid")
+    faults = read_faults(own.post("/v1/jobs", json=body), 422, "invalid")
     assert [one["pointer"] for one in faults] == [pointer]  # of type: no other is sought
 
 
@@ -136,17 +136,17 @@ def test_the_fields_of_an_object_are_counted_before_they_are_looked_at(own: Test
         if path == "/v1/models:check":
             assert answer.json()["errors"][0]["detail"] == told
         else:
-            assert refused(answer, 422, "invalid") == [{"pointer": "", "detail": told}]
+            assert read_faults(answer, 422, "invalid") == [{"pointer": "", "detail": told}]
 
 
 def test_more_faults_than_anybody_reads_are_counted_and_not_described(own: TestClient) -> None:
     axis: dict[str, Any] = {"path": "/seed", "values": [1], "labels": [0] * 10_001}
     body = {"model": "fopdt", "datasets": ["none"], "sweep": {"axes": [axis]}}
-    [fault] = refused(own.post("/v1/jobs", json=body), 422, "invalid")
+    [fault] = read_faults(own.post("/v1/jobs", json=body), 422, "invalid")
     assert fault["pointer"] == ""
     assert "the body has 10001 faults" in fault["detail"]
     axis["labels"].pop()
-    faults = refused(own.post("/v1/jobs", json=body), 422, "invalid")
+    faults = read_faults(own.post("/v1/jobs", json=body), 422, "invalid")
     assert faults[-1]["detail"] == "9000 more faults are not listed"
 
 
@@ -168,7 +168,7 @@ def test_long_bodies_are_read_outside_the_event_loop(monkeypatch: pytest.MonkeyP
         return get_ident()
 
     monkeypatch.setattr(bodies, "_read_body", read)
-    loop = awaited(play)
+    loop = await_in_thread(play)
     assert [thread == loop for thread in threads] == [True, False]
 
 
@@ -185,7 +185,7 @@ def test_objects_and_fields_are_counted_before_anything_is_made_of_them(
     monkeypatch.setattr(bodies, "check_shape", None)  # what would follow
     content = json.dumps(document, separators=(",", ":")).encode()
     for path in ("/v1/jobs", "/v1/models"):
-        [fault] = refused(own.post(path, content=content, headers=JSON), 422, "invalid")
+        [fault] = read_faults(own.post(path, content=content, headers=JSON), 422, "invalid")
         assert told in fault["detail"]
 
 

@@ -18,9 +18,9 @@ from service.core.value_schemas import describe_value
 from sysid.core.value_documents import list_fields
 from sysid.results.result import Result
 from sysid.uncertainty.estimates import Estimate
-from tests.identified import carried_out
-from tests.repository import ROOT
-from tests.rest import parts_of, refused, settings_of
+from tests.support.checkout import ROOT
+from tests.support.service.local_runs import carry_out_job
+from tests.support.service.web_app import parts_of, read_faults, settings_of
 
 SMALL = {"population": 20, "generations": 30, "islands": 1, "stop": {"evaluations": 3000}}
 STREAMED = ("stream_events",)
@@ -57,11 +57,11 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
         twice = {"axes": [{"path": "/seed", "values": [1, 2]}]}
         pair = post("/v1/jobs", "submit_job", algorithm=SMALL, sweep=twice)
         parts = parts_of(server)
-        carried_out(parts, batch)
-        runs = carried_out(parts, pair)
+        carry_out_job(parts, batch)
+        runs = carry_out_job(parts, pair)
         doomed_job = post("/v1/jobs", "submit_job", algorithm=SMALL, sweep=twice)
         doomed = {
-            examples.RUN: carried_out(parts, doomed_job)[0],
+            examples.RUN: carry_out_job(parts, doomed_job)[0],
             examples.JOB: doomed_job,
             examples.DATASET_ID: post(
                 "/v1/datasets:simulate", "simulate_dataset", name="doomed", samples=50
@@ -225,7 +225,7 @@ def test_the_committed_contract_is_that_of_the_application(world: World, file: P
 def test_an_unknown_name_in_a_query_is_refused(
     world: World, path: str, name: str, words: str
 ) -> None:
-    (fault,) = refused(world.server.get(path), 422, "invalid")
+    (fault,) = read_faults(world.server.get(path), 422, "invalid")
     assert fault["pointer"] == f"?{name}"
     assert words in fault["detail"]
 
@@ -247,14 +247,14 @@ def test_pages_read_names_of_their_own(world: World) -> None:
     ],
 )
 def test_a_cursor_that_no_page_has_given_is_refused(world: World, path: str, cursor: str) -> None:
-    (fault,) = refused(world.server.get(path, params={"cursor": cursor}), 422, "invalid")
+    (fault,) = read_faults(world.server.get(path, params={"cursor": cursor}), 422, "invalid")
     assert fault["pointer"] == "?cursor"
     assert "use the `next` of the previous page" in fault["detail"]
 
 
 def test_a_form_that_cannot_be_read_is_refused_like_other_bodies(world: World) -> None:
     kind = {"content-type": "multipart/form-data; boundary=x"}
-    (fault,) = refused(
+    (fault,) = read_faults(
         world.server.post("/v1/datasets", content=b"no form", headers=kind), 422, "invalid"
     )
     assert "the form cannot be read" in fault["detail"]

@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 
 from service.core.text import format_subtracted
 from service.formats.mcap import read_mcap
-from tests.rest import CSV, recording, refused, store_csv
+from tests.support.service.web_app import CSV, read_faults, recording, store_csv
 
 SIMULATION: dict[str, Any] = {
     "name": "example",
@@ -122,7 +122,7 @@ def test_a_range_outside_the_content_is_refused(server: TestClient, dataset: str
     path = f"/v1/datasets/{dataset}/content"
     size = len(server.get(path).content)
     answer = server.get(path, headers={"Range": f"bytes={size}-"})
-    refused(answer, 416, "range")
+    read_faults(answer, 416, "range")
     assert answer.headers["content-range"] == f"bytes */{size}"
 
 
@@ -131,7 +131,7 @@ def test_content_that_is_known_is_not_sent_again(server: TestClient, dataset: st
     etag = server.get(path).headers["etag"]
     assert server.get(path, headers={"If-None-Match": etag}).status_code == 304
     assert server.get(path, headers={"If-None-Match": '"x"'}).status_code == 200
-    refused(server.get(path, headers={"If-Match": '"x"'}), 412, "stale")
+    read_faults(server.get(path, headers={"If-Match": '"x"'}), 412, "stale")
     other = server.get(path, headers={"Range": "bytes=0-9", "If-Range": '"x"'})
     assert other.status_code == 200
 
@@ -290,7 +290,7 @@ def test_a_part_without_history_is_another_dataset(server: TestClient, dataset: 
     assert parts[1]["channels"][0]["history_start"] is None
     assert parts[0]["id"] != parts[1]["id"]
     bad = {"steps": [{"trim": {"start": 1, "history": 1}}]}
-    fault = refused(server.post(f"/v1/datasets/{dataset}:derive", json=bad), 422, "invalid")[0]
+    fault = read_faults(server.post(f"/v1/datasets/{dataset}:derive", json=bad), 422, "invalid")[0]
     assert fault["pointer"] == "/steps/0/trim/history"
 
 
@@ -356,6 +356,6 @@ def test_a_recorded_input_keeps_its_hold_and_comes_in_the_unit_of_the_model(
     assert not y.values[:11].any()  # no ramp leads to the jump
     assert y.values[20] == pytest.approx(1000 * (1 - np.exp(-2)), rel=1e-3)
     body["model"] = {**model, "inputs": {"u": "V"}}
-    fault = refused(server.post("/v1/datasets:simulate", json=body), 422, "invalid")[0]
+    fault = read_faults(server.post("/v1/datasets:simulate", json=body), 422, "invalid")[0]
     assert fault["pointer"] == "/inputs/u/channel"
     assert "is in kPa, but 'u' is in V" in fault["detail"]

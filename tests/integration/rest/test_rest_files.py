@@ -7,7 +7,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.formats.mcap import read_mcap
-from tests.recorded_files import (
+from tests.support.files.experiment_files import (
     INPUT,
     OUTPUT,
     START,
@@ -20,7 +20,7 @@ from tests.recorded_files import (
     write_npz,
     write_parquet,
 )
-from tests.rest import refused
+from tests.support.service.web_app import read_faults
 
 BYTES = {"content-type": "application/octet-stream"}
 ARRAYS = {"t": TIMES, "u": INPUT, "y": OUTPUT}
@@ -100,7 +100,7 @@ def test_a_file_that_cannot_be_used_is_refused_with_what_to_do(
     server: TestClient, content: bytes, words: str
 ) -> None:
     answer = server.post("/v1/datasets", content=content, headers=BYTES)
-    (fault,) = refused(answer, 422, "invalid-upload")
+    (fault,) = read_faults(answer, 422, "invalid-upload")
     assert words in fault["detail"]
 
 

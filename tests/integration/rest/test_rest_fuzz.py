@@ -7,8 +7,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from benchmarks.fuzz import Requests
-from tests.profiles import scale_examples
-from tests.rest import PROBLEM
+from tests.support.profiles import scale_examples
+from tests.support.service.web_app import PROBLEM
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,11 @@ from starlette.testclient import TestClient
 from service.api.app import create_app
 from service.client.calls import ProblemError, call
 from service.client.client import Client
-from tests.commands import check_refusal, run_lagid
-from tests.identified import identified
-from tests.models import LINE
-from tests.rest import parts_of, recording, refused, settings_of, store_csv
-from tests.serving import serve_in_thread
+from tests.support.library.small_models import LINE
+from tests.support.service.commands import check_refusal, run_lagid
+from tests.support.service.local_runs import identify_job
+from tests.support.service.web_app import parts_of, read_faults, recording, settings_of, store_csv
+from tests.support.service.web_server import serve_in_thread
 
 FAST = {"population": 10, "generations": 5, "islands": 1, "refine": False}
 
@@ -24,7 +24,7 @@ FAST = {"population": 10, "generations": 5, "islands": 1, "refine": False}
 def done(server: TestClient, dataset: str) -> tuple[str, str]:
     """An ended job and its run."""
     body = {"model": "fopdt", "datasets": [dataset], "algorithm": FAST, "name": "ended"}
-    job, (run,) = identified(parts_of(server), body)
+    job, (run,) = identify_job(parts_of(server), body)
     return job, run
 
 
@@ -34,7 +34,7 @@ def submit(server: TestClient, dataset: str, **changes: Any) -> str:
     return str(answer.json()["id"])
 
 
-def names(server: TestClient, path: str, **query: Any) -> list[str]:
+def list_names(server: TestClient, path: str, **query: Any) -> list[str]:
     answer = server.get(path, params=query)
     assert answer.status_code == 200, answer.text
     return [item["name"] for item in answer.json()["items"]]
@@ -50,7 +50,7 @@ def test_an_edit_answers_the_item_and_its_new_version(server: TestClient, datase
     assert (changed.json()["tags"], changed.json()["note"]) == (["a", "b"], "x")
     assert server.get(path).headers["etag"] == changed.headers["etag"] != first
     stale = server.patch(path, json={"name": "new"}, headers={"If-Match": first})
-    refused(stale, 412, "stale")
+    read_faults(stale, 412, "stale")
     assert server.patch(path, json={"name": "new"}).json()["name"] == "new"  # without If-Match
 
 
@@ -70,7 +70,7 @@ def test_an_edit_answers_the_item_and_its_new_version(server: TestClient, datase
 def test_an_edit_that_makes_no_sense_is_refused_where_it_is(
     server: TestClient, dataset: str, body: dict[str, Any], pointer: str
 ) -> None:
-    faults = refused(server.patch(f"/v1/datasets/{dataset}", json=body), 422, "invalid")
+    faults = read_faults(server.patch(f"/v1/datasets/{dataset}", json=body), 422, "invalid")
     assert [fault["pointer"] for fault in faults] == [pointer]
 
 
@@ -93,10 +93,10 @@ def test_every_kind_of_item_is_edited_and_read_with_its_version(
         read = server.get(f"/v1/{path}")
         assert (read.json()["tags"], read.json()["note"]) == (["good"], "seen")
         assert read.headers["etag"] == changed.headers["etag"]
-    refused(server.patch("/v1/models/fopdt", json={"note": "x"}), 404, "not-found")
-    refused(server.patch(f"/v1/runs/{run}", json={"name": "x"}), 422, "invalid")
+    read_faults(server.patch("/v1/models/fopdt", json={"note": "x"}), 404, "not-found")
+    read_faults(server.patch(f"/v1/runs/{run}", json={"name": "x"}), 422, "invalid")
     for path in ("jobs", "datasets", "models", "references"):
-        assert len(names(server, f"/v1/{path}", tag="good")) == 1
+        assert len(list_names(server, f"/v1/{path}", tag="good")) == 1
     runs = server.get(f"/v1/jobs/{job}/runs", params={"tag": "good"}).json()["items"]
     assert [one["id"] for one in runs] == [run]
     assert server.get(f"/v1/jobs/{job}/runs", params={"tag": "bad"}).json()["items"] == []
@@ -107,17 +107,17 @@ def test_lists_are_filtered_by_all_conditions(server: TestClient) -> None:
     axis = {"path": "/datasets", "values": [data], "labels": [{"length_m": 5}]}
     for name, more in (("Filtered A", {}), ("filtered b", {"sweep": {"axes": [axis]}})):
         submit(server, data, name=name, **more)
-    assert names(server, "/v1/jobs", name="FILTERED") == ["filtered b", "Filtered A"]
-    assert names(server, "/v1/jobs", dataset=data, label="length_m=5.0") == ["filtered b"]
-    assert names(server, "/v1/jobs", dataset=data, model="fopdt", state="queued", limit=1) == [
+    assert list_names(server, "/v1/jobs", name="FILTERED") == ["filtered b", "Filtered A"]
+    assert list_names(server, "/v1/jobs", dataset=data, label="length_m=5.0") == ["filtered b"]
+    assert list_names(server, "/v1/jobs", dataset=data, model="fopdt", state="queued", limit=1) == [
         "filtered b"
     ]
-    assert names(server, "/v1/jobs", dataset=data, state="failed") == []
-    assert names(server, "/v1/jobs", name="filtered", until="2020-01-01") == []
-    assert len(names(server, "/v1/jobs", name="filtered", since="2020-01-01T00:00:00Z")) == 2
-    assert names(server, "/v1/datasets", name="ter M") == ["Filter me"]
-    assert "fopdt" in names(server, "/v1/models", name="opd")
-    assert names(server, "/v1/models", name="opd", since="2020-01-01") == []
+    assert list_names(server, "/v1/jobs", dataset=data, state="failed") == []
+    assert list_names(server, "/v1/jobs", name="filtered", until="2020-01-01") == []
+    assert len(list_names(server, "/v1/jobs", name="filtered", since="2020-01-01T00:00:00Z")) == 2
+    assert list_names(server, "/v1/datasets", name="ter M") == ["Filter me"]
+    assert "fopdt" in list_names(server, "/v1/models", name="opd")
+    assert list_names(server, "/v1/models", name="opd", since="2020-01-01") == []
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_a_filter_that_makes_no_sense_is_refused(server: TestClient, query: str)
     if query == "until=1":  # seconds since 1970
         assert answer.json()["items"] == []
         return
-    refused(answer, 422, "invalid")
+    read_faults(answer, 422, "invalid")
 
 
 @pytest.mark.parametrize("moment", ["0001-01-01", "9999-12-31T23:59:59+00:00"])
@@ -151,10 +151,10 @@ def test_what_was_made_from_an_item_is_listed_and_deleted_on_request(own: TestCl
     data = store_csv(own, recording())
     derived = own.post(f"/v1/datasets/{data}:derive", json={"steps": [{"trim": {"stop": 20}}]})
     child = derived.json()["id"]
-    job, (run,) = identified(
+    job, (run,) = identify_job(
         parts_of(own), {"model": "fopdt", "datasets": [child], "algorithm": FAST}
     )
-    refused(own.delete(f"/v1/datasets/{data}"), 409, "conflict")
+    read_faults(own.delete(f"/v1/datasets/{data}"), 409, "conflict")
     document = own.delete(f"/v1/datasets/{data}").json()
     assert [(one["kind"], one["id"]) for one in document["dependents"]] == [
         ("dataset", child),
@@ -163,9 +163,9 @@ def test_what_was_made_from_an_item_is_listed_and_deleted_on_request(own: TestCl
     deleted = own.delete(f"/v1/datasets/{data}", params={"cascade": True})
     assert [one["id"] for one in deleted.json()["deleted"]] == [data, child, job]
     for path in (f"datasets/{data}", f"jobs/{job}", f"runs/{run}", f"jobs/{job}/runs"):
-        refused(own.get(f"/v1/{path}"), 404, "not-found")
+        read_faults(own.get(f"/v1/{path}"), 404, "not-found")
     for path in (f"datasets/{data}", f"jobs/{job}", f"runs/{run}"):
-        refused(own.delete(f"/v1/{path}"), 404, "not-found")  # as what was never there
+        read_faults(own.delete(f"/v1/{path}"), 404, "not-found")  # as what was never there
     again = store_csv(own, recording())
     assert again != data  # the same file may come again
     own.delete(f"/v1/datasets/{again}").raise_for_status()
@@ -174,7 +174,7 @@ def test_what_was_made_from_an_item_is_listed_and_deleted_on_request(own: TestCl
 def test_lineage_names_what_was_deleted(own: TestClient) -> None:
     data = store_csv(own, recording())
     body = {"model": "fopdt", "datasets": [data], "algorithm": FAST, "name": "gone"}
-    job, _ = identified(parts_of(own), body)
+    job, _ = identify_job(parts_of(own), body)
     own.delete(f"/v1/jobs/{job}").raise_for_status()
     lineage = own.get(f"/v1/datasets/{data}/lineage").json()
     assert [(one["parent"], one["child"]) for one in lineage["edges"]] == [(data, job)]
@@ -188,25 +188,25 @@ def test_lineage_names_what_was_deleted(own: TestClient) -> None:
 def test_an_open_job_must_be_cancelled_first(server: TestClient, dataset: str) -> None:
     job = submit(server, dataset)
     faults = server.delete(f"/v1/jobs/{job}")
-    refused(faults, 409, "conflict")
+    read_faults(faults, 409, "conflict")
     assert "ancel it" in faults.json()["detail"]
     server.post(f"/v1/jobs/{job}:cancel").raise_for_status()
     version = server.get(f"/v1/jobs/{job}").headers["etag"]
     stale = server.delete(f"/v1/jobs/{job}", headers={"If-Match": '"other"'})
-    refused(stale, 412, "stale")
+    read_faults(stale, 412, "stale")
     server.delete(f"/v1/jobs/{job}", headers={"If-Match": version}).raise_for_status()
-    refused(server.delete(f"/v1/jobs/{job}"), 404, "not-found")
+    read_faults(server.delete(f"/v1/jobs/{job}"), 404, "not-found")
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Client]]:
+def server_client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Client]]:
     app = create_app(settings_of(tmp_path_factory.mktemp("served")))
     with serve_in_thread(app) as url, Client(url) as client:
         yield url, client
 
 
-def test_the_client_edits_finds_and_deletes(served: tuple[str, Client]) -> None:
-    _, client = served
+def test_the_client_edits_finds_and_deletes(server_client: tuple[str, Client]) -> None:
+    _, client = server_client
     data = client.add_dataset(recording(), "steps")["id"]
     job = client.submit({"model": "fopdt", "datasets": [data], "name": "mine"})["id"]
     version = client.send(call("GET /v1/jobs/{}", job)).headers["ETag"]
@@ -224,8 +224,8 @@ def test_the_client_edits_finds_and_deletes(served: tuple[str, Client]) -> None:
     assert [one["id"] for one in deleted] == [data, job]
 
 
-def test_commands_edit_find_and_delete(served: tuple[str, Client], tmp_path: Path) -> None:
-    url, client = served
+def test_commands_edit_find_and_delete(server_client: tuple[str, Client], tmp_path: Path) -> None:
+    url, client = server_client
     client.add_dataset(recording(150), "tube 5")
     job = client.submit({"model": "fopdt", "datasets": ["tube 5"], "name": "five"})["id"]
 

@@ -13,7 +13,7 @@ from service.queue.run_writes import RunWriter
 from service.repositories.history import HistoryPoint
 from service.repositories.models import ModelRepository
 from service.storage.tables import Job
-from tests.rest import parts_of, recording, refused, store_csv
+from tests.support.service.web_app import parts_of, read_faults, recording, store_csv
 
 
 def submit(server: TestClient, dataset: str, **changes: Any) -> dict[str, Any]:
@@ -24,7 +24,7 @@ def submit(server: TestClient, dataset: str, **changes: Any) -> dict[str, Any]:
     return job
 
 
-def events(server: TestClient, job: str, **headers: str) -> list[str]:
+def list_events(server: TestClient, job: str, **headers: str) -> list[str]:
     answer = server.get(f"/v1/jobs/{job}/events", headers=headers)
     assert answer.status_code in (200, 204)
     return [
@@ -72,7 +72,7 @@ def test_the_same_key_gives_the_same_job_and_another_body_is_refused(
     first, again = (server.post("/v1/jobs", json=body, headers=key) for _ in range(2))
     assert first.json()["id"] == again.json()["id"]
     other = server.post("/v1/jobs", json={**body, "seed": 9}, headers=key)
-    refused(other, 422, "invalid")
+    read_faults(other, 422, "invalid")
 
 
 def test_crossed_axes_give_a_run_for_each_cell_and_zipped_ones_step_together(
@@ -135,9 +135,9 @@ def test_a_queued_job_is_cancelled_at_once_resumed_and_cloned(
     server: TestClient, dataset: str
 ) -> None:
     job = submit(server, dataset, seed=5)["id"]
-    refused(server.post(f"/v1/jobs/{job}:resume"), 409, "conflict")
+    read_faults(server.post(f"/v1/jobs/{job}:resume"), 409, "conflict")
     assert server.post(f"/v1/jobs/{job}:cancel").json()["state"] == "cancelled"
-    assert events(server, job) == ["state", "state", "end"]
+    assert list_events(server, job) == ["state", "state", "end"]
     assert server.post(f"/v1/jobs/{job}:resume").json()["state"] == "queued"
     twin = server.post(f"/v1/jobs/{job}:clone").json()
     assert twin["id"] != job
@@ -192,15 +192,15 @@ def test_events_resume_after_the_last_one_known_and_end_with_the_job(
     with parts.database.write_session() as session:
         LeaseQueue(session).append_event(claim.lease, "log", {"text": "half way"})
         LeaseQueue(session).finish_job(claim.lease, JobState.FAILED, "no candidate was finite")
-    assert events(own, job) == ["state", "state", "log", "state", "end"]
-    assert events(own, job, **{"Last-Event-ID": "3"}) == ["state", "end"]
-    assert events(own, job, **{"Last-Event-ID": "5"}) == []
+    assert list_events(own, job) == ["state", "state", "log", "state", "end"]
+    assert list_events(own, job, **{"Last-Event-ID": "3"}) == ["state", "end"]
+    assert list_events(own, job, **{"Last-Event-ID": "5"}) == []
     for text in ("x", "-1", "9" * 19, "9" * 30, "9" * 5000):
         answer = own.get(f"/v1/jobs/{job}/events", headers={"Last-Event-ID": text})
-        refused(answer, 422, "invalid")
+        read_faults(answer, 422, "invalid")
     read = own.get(f"/v1/jobs/{job}").json()
     assert (read["state"], read["error"]) == ("failed", "no candidate was finite")
-    refused(own.post(f"/v1/jobs/{job}:cancel"), 409, "conflict")
+    read_faults(own.post(f"/v1/jobs/{job}:cancel"), 409, "conflict")
 
 
 def test_a_stream_is_whole_whatever_is_read_at_once(
@@ -211,11 +211,11 @@ def test_a_stream_is_whole_whatever_is_read_at_once(
         assert server.post(f"/v1/jobs/{job}:cancel").status_code == 200
         assert server.post(f"/v1/jobs/{job}:resume").status_code == 202
     server.post(f"/v1/jobs/{job}:cancel")
-    whole = events(server, job)
+    whole = list_events(server, job)
     assert whole == ["state", *["state", "end", "state"] * 3, "state", "end"]
     for most in (1, 2, len(whole)):
         monkeypatch.setattr(event_feed, "MAX_BATCH_EVENTS", most)
-        assert events(server, job) == whole
+        assert list_events(server, job) == whole
 
 
 def test_an_open_stream_ends_when_the_process_is_to_end(own: TestClient) -> None:
@@ -233,7 +233,7 @@ def test_an_open_stream_ends_when_the_process_is_to_end(own: TestClient) -> None
     job = submit(own, answer.json()["id"])["id"]
     parts = parts_of(own)
     parts.stopping.set()
-    assert events(own, job) == []  # the stream would not end otherwise: the job is queued
+    assert list_events(own, job) == []  # the stream would not end otherwise: the job is queued
 
 
 def test_an_axis_over_an_object_gives_each_run_the_whole_object(
@@ -290,7 +290,9 @@ def test_a_summary_over_an_axis_that_is_not_there_names_those_that_are(
     server: TestClient, dataset: str
 ) -> None:
     job = submit(server, dataset, sweep={"axes": [{"path": "/seed", "range": [0, 3]}]})["id"]
-    (fault,) = refused(server.get(f"/v1/jobs/{job}/summary", params={"by": "/sed"}), 422, "invalid")
+    (fault,) = read_faults(
+        server.get(f"/v1/jobs/{job}/summary", params={"by": "/sed"}), 422, "invalid"
+    )
     assert fault["pointer"] == "?by"
     assert "no axis or label '/sed'" in fault["detail"]
     assert "/seed" in fault["detail"]
@@ -347,7 +349,7 @@ def test_a_job_whose_model_an_earlier_version_accepted_stays_in_the_lists(
         "outputs": {"y": "x"},
         "initial": {"x": 0},
     }
-    refused(
+    read_faults(
         server.post("/v1/jobs", json={"model": model, "datasets": [dataset]}),
         422,
         "invalid",

@@ -10,8 +10,8 @@ from starlette.testclient import TestClient
 from service.api.app import create_app
 from service.datasets.recordings import load_recording
 from service.sweeps import output_spread
-from tests.identified import carried_out
-from tests.rest import parts_of, recording, refused, settings_of, store_csv
+from tests.support.service.local_runs import carry_out_job
+from tests.support.service.web_app import parts_of, read_faults, recording, settings_of, store_csv
 
 URL = "/v1/recipes/noise-sweep"
 TRUE = {"K": 2.0, "T": 1.0, "L": 0.5, "y0": 0.0}
@@ -33,7 +33,7 @@ BODY: dict[str, Any] = {
 }
 
 
-def submitted(server: TestClient, **changes: Any) -> dict[str, Any]:
+def submit_sweep(server: TestClient, **changes: Any) -> dict[str, Any]:
     answer = server.post(URL, json={**BODY, **changes})
     assert answer.status_code == 202, answer.text
     job: dict[str, Any] = answer.json()
@@ -41,21 +41,21 @@ def submitted(server: TestClient, **changes: Any) -> dict[str, Any]:
     return job
 
 
-def ended(server: TestClient, **changes: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+def carry_out_sweep(server: TestClient, **changes: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     """A sweep that was carried out: the job, and its summary."""
-    job = submitted(server, **changes)["id"]
-    carried_out(parts_of(server), job)
+    job = submit_sweep(server, **changes)["id"]
+    carry_out_job(parts_of(server), job)
     return (server.get(f"/v1/jobs/{job}").json(), server.get(f"/v1/jobs/{job}/summary").json())
 
 
-def numbers(summary: dict[str, Any]) -> dict[str, Any]:
+def read_numbers(summary: dict[str, Any]) -> dict[str, Any]:
     """A summary without what belongs to one job and one computer."""
     groups = [{**group, "seconds": None} for group in summary["groups"]]
     return {**summary, "job": None, "reused": None, "groups": groups}
 
 
 def test_the_job_has_a_run_for_each_deviation_replicate_and_method(server: TestClient) -> None:
-    job = submitted(server, name="mine", replicates=3)
+    job = submit_sweep(server, name="mine", replicates=3)
     assert job["name"] == "mine"
     assert job["progress"]["runs"] == 12
     runs = server.get(f"/v1/jobs/{job['id']}/runs").json()["items"]
@@ -68,7 +68,7 @@ def test_the_job_has_a_run_for_each_deviation_replicate_and_method(server: TestC
 
 def test_the_draws_of_a_replicate_do_not_depend_on_the_grid(server: TestClient) -> None:
     def draws(**changes: Any) -> set[tuple[Any, ...]]:
-        job = submitted(server, **changes)["id"]
+        job = submit_sweep(server, **changes)["id"]
         runs = server.get(f"/v1/jobs/{job}/runs", params={"limit": 100}).json()["items"]
         return {tuple(run["cell"].values()) for run in runs}
 
@@ -83,7 +83,7 @@ def test_a_run_without_noise_is_added_only_where_the_truth_is_unknown(
     server: TestClient, dataset: str
 ) -> None:
     def sigmas(**changes: Any) -> list[float]:
-        job = submitted(server, sigma=[0.1], replicates=1, methods=["simple"], **changes)["id"]
+        job = submit_sweep(server, sigma=[0.1], replicates=1, methods=["simple"], **changes)["id"]
         runs = server.get(f"/v1/jobs/{job}/runs").json()["items"]
         return [run["cell"]["/noise/sigma"] for run in runs]
 
@@ -96,7 +96,7 @@ def test_the_same_key_gives_the_same_job(server: TestClient) -> None:
     first, again = (server.post(URL, json=BODY, headers=key).json() for _ in range(2))
     assert first["id"] == again["id"]
     other = server.post(URL, json={**BODY, "replicates": 9}, headers=key)
-    refused(other, 422, "invalid")
+    read_faults(other, 422, "invalid")
 
 
 def datasets_of(server: TestClient) -> list[str]:
@@ -118,7 +118,7 @@ def test_a_body_that_is_refused_leaves_no_dataset_behind(
 ) -> None:
     body = {**BODY, "truth": {**TRUTH, "samples": 149}, **fields}  # of no other test
     before = datasets_of(server)
-    refused(server.post(URL, json=body), 422, "invalid")
+    read_faults(server.post(URL, json=body), 422, "invalid")
     assert datasets_of(server) == before
 
 
@@ -128,7 +128,7 @@ def test_a_key_that_was_used_with_another_body_leaves_no_dataset_behind(own: Tes
     first = own.post(URL, json=body, headers=key).json()["id"]
     (dataset,) = datasets_of(own)
     other = own.post(URL, json={**body, "truth": {**TRUTH, "samples": 151}}, headers=key)
-    refused(other, 422, "invalid")
+    read_faults(other, 422, "invalid")
     assert datasets_of(own) == [dataset]
     # The second time σ comes from the stored record, the first time from the one in memory.
     assert own.post(URL, json=body, headers=key).json()["id"] == first
@@ -142,7 +142,7 @@ def test_a_relative_deviation_reads_no_more_than_a_request_may(
     # 300 samples of two channels
     monkeypatch.setattr(output_spread, "MAX_READ_VALUES", 599)
     monkeypatch.setattr(output_spread, "load_recording", None)
-    (fault,) = refused(server.post(URL, json=body), 422, "invalid")
+    (fault,) = read_faults(server.post(URL, json=body), 422, "invalid")
     assert fault["pointer"] == "/relative"
     assert "the datasets have 600 values; at most 599" in fault["detail"]
 
@@ -153,37 +153,37 @@ def test_recordings_are_read_while_no_session_is_open(
     seen = []
     pool: Any = parts_of(server).database.engine.pool
 
-    def noted(*given: Any) -> Any:
+    def note_and_load(*given: Any) -> Any:
         seen.append(pool.checkedout())
         return load_recording(*given)
 
-    monkeypatch.setattr(output_spread, "load_recording", noted)
+    monkeypatch.setattr(output_spread, "load_recording", note_and_load)
     body = {**BODY, "truth": None, "datasets": [dataset], "relative": True}
     assert server.post(URL, json=body).status_code == 202
     assert seen == [0]
 
 
 def test_the_same_sweep_twice_gives_the_same_numbers(server: TestClient) -> None:
-    _, first = ended(server)
-    job, again = ended(server, reuse=False)
+    _, first = carry_out_sweep(server)
+    job, again = carry_out_sweep(server, reuse=False)
     assert job["progress"]["reused"] == 0
-    assert numbers(first) == numbers(again)
+    assert read_numbers(first) == read_numbers(again)
     assert first["groups"][2]["rms_noise_free"][2] > 0
 
 
 def test_more_replicates_compute_only_the_new_runs_and_say_so(own: TestClient) -> None:
-    _, first = ended(own)
-    job, more = ended(own, replicates=3)
+    _, first = carry_out_sweep(own)
+    job, more = carry_out_sweep(own, replicates=3)
     assert (first["reused"], first["runs"]) == (0, 8)
     assert (more["reused"], more["runs"]) == (8, 12)
     assert job["progress"]["reused"] == 8
     assert "8 of 12 reused" in own.get(f"/jobs/{job['id']}").text
-    _, other = ended(own, replicates=3, sigma=[0.1, 0.2])
+    _, other = carry_out_sweep(own, replicates=3, sigma=[0.1, 0.2])
     assert (other["reused"], other["runs"]) == (6, 12)
 
 
 def test_errors_are_from_the_truth_and_the_bound_grows_in_proportion(server: TestClient) -> None:
-    _, found = ended(server, sigma=[0, 0.1, 0.2])
+    _, found = carry_out_sweep(server, sigma=[0, 0.1, 0.2])
     (reference,) = found["references"]
     assert (reference["kind"], reference["note"]) == ("truth", "")
     assert {name: reference["parameters"][name] for name in TRUE} == TRUE
@@ -207,7 +207,7 @@ def test_errors_are_from_the_truth_and_the_bound_grows_in_proportion(server: Tes
 
 def test_without_truth_errors_are_from_the_best_run_without_noise(server: TestClient) -> None:
     stored = store_csv(server, recording())
-    job, found = ended(server, truth=None, datasets=[stored], sigma=[0.1], replicates=1)
+    job, found = carry_out_sweep(server, truth=None, datasets=[stored], sigma=[0.1], replicates=1)
     assert job["progress"]["runs"] == 4  # σ = 0 was added
     (reference,) = found["references"]
     runs = server.get(f"/v1/jobs/{job['id']}/runs").json()["items"]
@@ -225,8 +225,8 @@ def test_a_truth_of_another_model_is_no_truth(server: TestClient) -> None:
     document = server.get("/v1/models/fopdt").json()["document"]
     other = {**document, "name": "other"}
     changes = {"truth": None, "datasets": [stored], "sigma": [0], "replicates": 1}
-    _, same = ended(server, **changes)
-    _, apart = ended(server, **changes, model=other)
+    _, same = carry_out_sweep(server, **changes)
+    _, apart = carry_out_sweep(server, **changes, model=other)
     assert [one["kind"] for one in same["references"]] == ["truth"]
     assert [one["kind"] for one in apart["references"]] == ["estimate"]
 
@@ -245,7 +245,7 @@ def test_each_problem_of_a_sweep_has_a_truth_and_a_bound_of_its_own(server: Test
         "sweep": {"axes": axes},
     }
     job = server.post("/v1/jobs", json=body).json()["id"]
-    carried_out(parts_of(server), job)
+    carry_out_job(parts_of(server), job)
     found = server.get(f"/v1/jobs/{job}/summary").json()
     gains = [
         next(one for one in group["parameters"] if one["name"] == "K") for group in found["groups"]
@@ -263,7 +263,7 @@ def test_a_job_without_noise_tells_no_bound(server: TestClient) -> None:
         "/v1/jobs",
         json={"model": "fopdt", "datasets": [stored], "algorithm": SMALL, "parameters": BOUNDS},
     ).json()["id"]
-    carried_out(parts_of(server), job)
+    carry_out_job(parts_of(server), job)
     found = server.get(f"/v1/jobs/{job}/summary").json()
     assert found["references"] == []
     assert found["groups"][0]["rms_cramer_rao_bound"] is None
@@ -275,14 +275,14 @@ def test_relative_deviations_are_in_those_of_the_output(server: TestClient) -> N
     y = [float(line.split(",")[2]) for line in lines]
     mean = sum(y) / len(y)
     spread = math.sqrt(sum((one - mean) ** 2 for one in y) / len(y))
-    job = submitted(server, truth=None, datasets=[stored], sigma=[0, 0.5], relative=True)
+    job = submit_sweep(server, truth=None, datasets=[stored], sigma=[0, 0.5], relative=True)
     runs = server.get(f"/v1/jobs/{job['id']}/runs").json()["items"]
     assert runs[-1]["cell"]["/noise/sigma"] == pytest.approx(0.5 * spread)
     assert runs[-1]["labels"] == {"relative": 0.5}
 
 
 def test_the_figure_has_a_line_a_method_in_each_plot_and_the_bound(server: TestClient) -> None:
-    job, found = ended(server)
+    job, found = carry_out_sweep(server)
     figure = server.get(f"/v1/jobs/{job['id']}/figures/summary").json()
     lines = [one for one in figure["data"] if one["mode"] == "lines+markers"]
     names = [one["name"] for one in found["groups"][0]["parameters"]]
@@ -342,7 +342,7 @@ def test_what_cannot_be_swept_is_refused_at_its_place(
     server: TestClient, changes: dict[str, Any], pointer: str, detail: str
 ) -> None:
     answer = server.post(URL, json={**BODY, **changes})
-    faults = refused(answer, 422, "invalid")
+    faults = read_faults(answer, 422, "invalid")
     assert pointer in [fault["pointer"] for fault in faults], faults
     assert any(detail in fault["detail"] for fault in faults), faults
 
@@ -355,7 +355,7 @@ def test_a_deviation_relative_to_an_output_that_does_not_vary_is_refused(
         "parameters": {**TRUE, "K": 1.0},
         "inputs": {"u": {"kind": "step", "amplitude": 0.0}},
     }
-    (fault,) = refused(
+    (fault,) = read_faults(
         server.post(URL, json={**BODY, "truth": still, "relative": True}), 422, "invalid"
     )
     assert fault["pointer"] == "/relative"
@@ -366,7 +366,7 @@ def test_a_deviation_relative_to_several_outputs_is_refused(server: TestClient) 
     document = server.get("/v1/models/fopdt").json()["document"]
     twice = {**document, "name": "two", "outputs": {**document["outputs"], "z": "2*x"}}
     answer = server.post(URL, json={**BODY, "model": twice, "relative": True})
-    (fault,) = refused(answer, 422, "invalid")
+    (fault,) = read_faults(answer, 422, "invalid")
     assert fault["pointer"] == "/relative"
     assert "outputs" in fault["detail"]
 
@@ -374,5 +374,5 @@ def test_a_deviation_relative_to_several_outputs_is_refused(server: TestClient) 
 def test_the_limit_of_the_settings_is_that_of_the_sweep(tmp_path: Path) -> None:
     app = create_app(settings_of(tmp_path, max_runs_per_job=7))
     with TestClient(app, raise_server_exceptions=False) as server:
-        (fault,) = refused(server.post(URL, json=BODY), 422, "invalid")
+        (fault,) = read_faults(server.post(URL, json=BODY), 422, "invalid")
     assert "8 runs; a job may have at most 7" in fault["detail"]

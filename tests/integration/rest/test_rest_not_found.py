@@ -3,7 +3,7 @@
 import pytest
 from starlette.testclient import TestClient
 
-from tests.rest import refused
+from tests.support.service.web_app import read_faults
 
 
 @pytest.mark.parametrize(
@@ -24,13 +24,13 @@ from tests.rest import refused
     ],
 )
 def test_what_is_not_there_is_not_found(server: TestClient, path: str) -> None:
-    refused(server.get(path), 404, "not-found")
+    read_faults(server.get(path), 404, "not-found")
 
 
 def test_an_action_on_a_job_that_is_not_there_is_not_found(server: TestClient) -> None:
     for verb in ("cancel", "resume", "clone"):
-        refused(server.post(f"/v1/jobs/job_0:{verb}"), 404, "not-found")
+        read_faults(server.post(f"/v1/jobs/job_0:{verb}"), 404, "not-found")
 
 
 def test_a_method_that_a_path_does_not_have_is_refused(server: TestClient) -> None:
-    refused(server.delete("/v1/jobs"), 405, "method-not-allowed")
+    read_faults(server.delete("/v1/jobs"), 405, "method-not-allowed")

@@ -14,7 +14,7 @@ from service.core.logs import ACCESS_LOGGER, JsonFormatter, TextFormatter
 from service.queue.dispatchers import LEASE_SECONDS_KEY, STARTING_KEY, DispatcherRepository
 from service.repositories.jobs import JobRepository
 from service.storage.errors import ObjectStoreFailed
-from tests.rest import parts_of, refused
+from tests.support.service.web_app import parts_of, read_faults
 
 Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
 
@@ -45,7 +45,7 @@ def test_a_sane_id_of_the_sender_is_kept_and_is_in_the_problem_document(
     server: TestClient,
 ) -> None:
     answer = server.get("/v1/jobs/none", headers={"X-Request-ID": "proxy-7.a:1"})
-    refused(answer, 404, "not-found")
+    read_faults(answer, 404, "not-found")
     assert answer.headers["x-request-id"] == answer.json()["request_id"] == "proxy-7.a:1"
 
 
@@ -71,7 +71,7 @@ def test_an_unexpected_error_is_counted_logged_and_has_its_id(
     monkeypatch.setattr(JobRepository, "get", fail)
     quiet = TestClient(server.app, raise_server_exceptions=False)
     answer = quiet.get("/v1/jobs/job_1", headers={"X-Request-ID": "r1"})
-    refused(answer, 500, "internal")
+    read_faults(answer, 500, "internal")
     assert answer.headers["x-request-id"] == answer.json()["request_id"] == "r1"
     after = find_value(read_samples(server), "lagid_http_requests_total", **labels)
     assert after == before + 1
@@ -172,7 +172,7 @@ def test_readiness_says_what_a_dispatcher_waits_for(server: TestClient, dataset:
 
     tell("d1", **{STARTING_KEY: ["ray", "search"]})
     answer = server.get("/readyz")
-    (fault,) = refused(answer, 503, "unavailable")
+    (fault,) = read_faults(answer, 503, "unavailable")
     assert re.search(r"starting \(\d+ s\): Ray is starting and the search is comp", fault["detail"])
     assert (count("starting"), count("ready")) == (1, 0)
     job = server.post("/v1/jobs", json={"model": "fopdt", "datasets": [dataset]}).json()["id"]

@@ -7,14 +7,14 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
-from tests.identified import identified
-from tests.rest import parts_of, recording, refused, settings_of, store_csv
+from tests.support.service.local_runs import identify_job
+from tests.support.service.web_app import parts_of, read_faults, recording, settings_of, store_csv
 
 HALF = "\ud800"
 SMALL = {"population": 16, "generations": 5, "islands": 1}
 
 
-def sent(server: TestClient, path: str, body: Any) -> Any:
+def send_body(server: TestClient, path: str, body: Any) -> Any:
     """The answer to a body that the client's own JSON would refuse."""
     return server.post(path, content=json.dumps(body), headers={"content-type": "application/json"})
 
@@ -24,7 +24,7 @@ def test_a_batch_whose_recordings_are_no_names_is_refused(server: TestClient, da
         axis = {"path": "/datasets", "values": [[dataset], given], "labels": [{"n": 1}, {"n": 2}]}
         body = {"model": "fopdt", "datasets": [dataset], "sweep": {"axes": [axis]}}
         answer = server.post("/v1/jobs", json={**body, "trend": {"x": "n"}})
-        faults = refused(answer, 422, "invalid")
+        faults = read_faults(answer, 422, "invalid")
         assert {one["pointer"] for one in faults} == {"/sweep/axes/0/values/1"}, given
 
 
@@ -68,7 +68,7 @@ def test_a_batch_whose_recordings_are_no_names_is_refused(server: TestClient, da
 def test_half_of_a_surrogate_pair_is_refused(
     server: TestClient, dataset: str, path: str, body: dict[str, Any]
 ) -> None:
-    answer = sent(server, path, body)
+    answer = send_body(server, path, body)
     assert 400 <= answer.status_code < 500, answer.text
     assert answer.json()["detail"]
 
@@ -77,7 +77,7 @@ def test_half_of_a_surrogate_pair_is_refused(
 def test_a_model_that_cannot_be_stored_is_not_called_valid(server: TestClient, text: str) -> None:
     document = server.get("/v1/models/fopdt").json()["document"]
     for changed in ({"title": text}, {text: 1}):
-        told = sent(server, "/v1/models:check", {**document, **changed}).json()
+        told = send_body(server, "/v1/models:check", {**document, **changed}).json()
         assert told["valid"] is False
         assert "text contains" in told["errors"][0]["detail"]
 
@@ -85,7 +85,7 @@ def test_a_model_that_cannot_be_stored_is_not_called_valid(server: TestClient, t
 def test_a_very_long_value_is_not_repeated_in_full(server: TestClient) -> None:
     body = {"model": "fopdt", "datasets": ["a" * 100_000]}
     answer = server.post("/v1/jobs", json=body)
-    [fault] = refused(answer, 422, "invalid")
+    [fault] = read_faults(answer, 422, "invalid")
     assert fault["detail"].startswith("there is no dataset 'aaa")
     assert len(answer.content) < 25_000
 
@@ -94,7 +94,7 @@ def test_times_at_the_ends_of_what_doubles_can_hold_are_simulated_or_refused(tmp
     with TestClient(create_app(settings_of(tmp_path)), raise_server_exceptions=False) as server:
         steps = store_csv(server, recording())
         job = {"model": "fopdt", "datasets": [steps], "algorithm": SMALL}
-        _, [run] = identified(parts_of(server), job)
+        _, [run] = identify_job(parts_of(server), job)
         for times, status in (([0, 1e-320], 200), ([1e-320, 2e-320], 200), ([-1e308, 0], 422)):
             series = {"kind": "series", "times": times, "values": [0, 1], "hold": "zero"}
             body = {"inputs": {"u": series}, "samples": 51, "sample_time": 0.1}
@@ -109,7 +109,7 @@ def test_of_very_many_wrong_values_some_are_told_and_the_rest_is_not_looked_at(
     wrong = [f"m{n}" if path == "/model" else -100 - n for n in range(3000)]
     axis = {"path": path, "values": wrong}
     body = {"model": "tube", "datasets": [dataset], "sweep": {"axes": [axis]}}
-    faults = refused(server.post("/v1/jobs", json=body), 422, "invalid")
+    faults = read_faults(server.post("/v1/jobs", json=body), 422, "invalid")
     assert [one["pointer"] for one in faults[:-1]] == [
         f"/sweep/axes/0/values/{n}" for n in range(200)
     ]
@@ -118,13 +118,13 @@ def test_of_very_many_wrong_values_some_are_told_and_the_rest_is_not_looked_at(
         "detail": "200 faulty axis values are reported. The rest is not checked",
     }
     axis["values"] = [*wrong[:200], 0.5 if path != "/model" else "tube"]
-    assert len(refused(server.post("/v1/jobs", json=body), 422, "invalid")) <= 201
+    assert len(read_faults(server.post("/v1/jobs", json=body), 422, "invalid")) <= 201
 
 
 def test_of_very_many_faults_a_thousand_are_told(server: TestClient, dataset: str) -> None:
     names = {f"p{n}": {"upper": 1} for n in range(5000)}
     body = {"model": "fopdt", "datasets": [dataset], "parameters": names}
-    faults = refused(server.post("/v1/jobs", json=body), 422, "invalid")
+    faults = read_faults(server.post("/v1/jobs", json=body), 422, "invalid")
     assert len(faults) == 1002
     assert faults[-1]["detail"] == "more faults follow; they are not listed"
 
@@ -156,7 +156,7 @@ def test_positions_and_filters_that_no_database_can_compare_are_refused_or_match
     if answer.status_code == 200:
         assert answer.json()["items"] == []
     else:
-        assert refused(answer, 422, "invalid") is not None
+        assert read_faults(answer, 422, "invalid") is not None
         assert len(answer.content) < 7000
 
 
@@ -165,4 +165,4 @@ def test_a_range_of_5000_digits_ends_with_the_file(server: TestClient, dataset: 
     whole = server.get(path).content
     answer = server.get(path, headers={"Range": f"bytes=0-{'9' * 5000}"})
     assert (answer.status_code, answer.content) == (206, whole)
-    refused(server.get(path, headers={"Range": f"bytes={'9' * 5000}-"}), 416, "range")
+    read_faults(server.get(path, headers={"Range": f"bytes={'9' * 5000}-"}), 416, "range")

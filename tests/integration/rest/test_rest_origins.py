@@ -8,7 +8,7 @@ from starlette.testclient import TestClient
 
 from service.api.app import create_app
 from service.core.settings import Settings
-from tests.rest import CSV, recording, refused, settings_of
+from tests.support.service.web_app import CSV, read_faults, recording, settings_of
 
 HERE = "127.0.0.1:8000"
 MODEL = b'{"name": "tank"}'
@@ -28,7 +28,7 @@ def door(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
 def test_a_name_that_was_rebound_to_loopback_is_not_answered(
     door: TestClient, path: str, host: str
 ) -> None:
-    refused(door.get(path, headers={"Host": host}), 421, "misdirected")
+    read_faults(door.get(path, headers={"Host": host}), 421, "misdirected")
 
 
 def test_a_browser_is_told_by_a_page_which_names_are_served(door: TestClient) -> None:
@@ -57,7 +57,7 @@ def test_names_of_loopback_and_allowed_names_are_answered(door: TestClient, host
 
 def test_one_foreign_name_among_several_is_refused(door: TestClient) -> None:
     both = [("Host", HERE), ("Host", "evil.example")]
-    refused(door.get("/v1/jobs", headers=both), 421, "misdirected")
+    read_faults(door.get("/v1/jobs", headers=both), 421, "misdirected")
 
 
 @pytest.mark.parametrize(
@@ -102,10 +102,12 @@ def test_a_page_of_another_origin_changes_nothing(
         ("/v1/jobs", json, b"{}"),
     ):
         answer = door.post(path, content=content, headers={**kind, **headers})
-        refused(answer, 403, "foreign-origin")
+        read_faults(answer, 403, "foreign-origin")
     form = door.post("/v1/datasets", files={"file": ("a.csv", recording())}, headers=headers)
-    refused(form, 403, "foreign-origin")
-    refused(door.put("/v1/references/a", json={"run": "r"}, headers=headers), 403, "foreign-origin")
+    read_faults(form, 403, "foreign-origin")
+    read_faults(
+        door.put("/v1/references/a", json={"run": "r"}, headers=headers), 403, "foreign-origin"
+    )
     assert door.get("/v1/datasets").json()["items"] == []
     assert door.get("/v1/datasets", headers=headers).status_code == 200
 
@@ -133,12 +135,12 @@ def test_a_body_without_its_media_type_is_refused(
 ) -> None:
     headers = {} if kind is None else {"Content-Type": kind}
     answer = door.post(path, content=MODEL, headers=headers)
-    refused(answer, 415, "unsupported-media-type")
+    read_faults(answer, 415, "unsupported-media-type")
     assert (kind or "") in answer.json()["detail"]
 
 
 def test_an_upload_needs_its_media_type(door: TestClient) -> None:
-    refused(door.post("/v1/datasets", content=recording()), 415, "unsupported-media-type")
+    read_faults(door.post("/v1/datasets", content=recording()), 415, "unsupported-media-type")
 
 
 def test_every_answer_forbids_guessed_types_and_use_by_other_origins(

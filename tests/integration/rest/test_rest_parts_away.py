@@ -16,7 +16,7 @@ from service.api.store_probe import PROBE_SECONDS
 from service.datasets import datasets
 from service.formats import sandbox
 from service.storage.errors import ObjectStoreFailed
-from tests.rest import CSV, parts_of, recording, refused, settings_of
+from tests.support.service.web_app import CSV, parts_of, read_faults, recording, settings_of
 
 
 def away(*_args: Any, **_options: Any) -> Any:
@@ -29,7 +29,7 @@ def test_a_database_that_is_away_is_a_part_that_is_down(
 ) -> None:
     monkeypatch.setattr(parts_of(server).database, "read_session", away)
     answer = server.get(path)
-    assert refused(answer, 503, "unavailable") == []
+    assert read_faults(answer, 503, "unavailable") == []
     assert answer.headers["retry-after"] == "1"
 
 
@@ -47,12 +47,12 @@ def test_readiness_tells_a_stranger_no_address_and_writes_seldom(
     monkeypatch.setattr(parts.probe, "_tried_at", -PROBE_SECONDS)
     answers = [server.get("/readyz") for _ in range(3)]
     for answer in answers:
-        refused(answer, 503, "unavailable")
+        read_faults(answer, 503, "unavailable")
         assert answer.json()["detail"] == "store: objects cannot be written; database: unreachable"
     assert writes == [1]
     monkeypatch.undo()
     parts.probe._tried_at = -PROBE_SECONDS
-    faults = refused(server.get("/readyz"), 503, "unavailable")
+    faults = read_faults(server.get("/readyz"), 503, "unavailable")
     assert [fault["pointer"] for fault in faults] == ["/dispatcher"]
 
 
@@ -64,7 +64,7 @@ def test_a_full_disk_is_a_part_that_is_down(
 
     monkeypatch.setattr(content, "_save_body", full)
     answer = server.post("/v1/datasets", content=recording(), headers=CSV)
-    refused(answer, 503, "unavailable")
+    read_faults(answer, 503, "unavailable")
     assert "a disk of the server is full" in answer.json()["detail"]
     assert answer.headers["retry-after"] == "1"
 
@@ -83,7 +83,7 @@ def test_a_full_folder_of_the_reading_process_is_no_fault_of_the_file(
 ) -> None:
     monkeypatch.setattr(sandbox, "TemporaryDirectory", FullFolder)
     answer = server.post("/v1/datasets", content=recording(period=0.07), headers=CSV)
-    refused(answer, 503, "unavailable")
+    read_faults(answer, 503, "unavailable")
     assert "a disk of the server is full" in answer.json()["detail"]
     assert answer.headers["retry-after"] == "1"
 
@@ -96,7 +96,7 @@ def test_an_object_store_that_is_full_says_when_to_come_back(
 
     monkeypatch.setattr(parts_of(server).store, "put_file", full)
     answer = server.post("/v1/datasets", content=recording(period=0.06), headers=CSV)
-    refused(answer, 503, "unavailable")
+    read_faults(answer, 503, "unavailable")
     assert answer.headers["retry-after"] == "1"
 
 
@@ -110,12 +110,12 @@ def test_uploads_at_once_are_bounded_and_each_gives_its_place_back(
     with TestClient(app, raise_server_exceptions=False) as client:
         places = parts_of(client).upload_places
         assert post(recording()).status_code == 201
-        refused(post(b"no recording"), 422, "invalid-upload")
+        read_faults(post(b"no recording"), 422, "invalid-upload")
         monkeypatch.setattr(content, "MAX_WAIT_SECONDS", 0.1)
         assert client.portal is not None
         client.portal.call(places.acquire)  # as an upload that is on its way
         answer = post(recording(period=0.2))
-        refused(answer, 503, "unavailable")
+        read_faults(answer, 503, "unavailable")
         assert "LAGID_MAX_UPLOADS" in answer.json()["detail"]
         assert int(answer.headers["retry-after"]) > 0
         client.portal.call(places.release)
@@ -139,7 +139,7 @@ def test_another_fault_of_a_disk_is_not_told_as_a_full_one_and_its_words_stay_in
 
     monkeypatch.setattr(content, "_save_body", broken)
     answer = server.post("/v1/datasets", content=recording(), headers=CSV)
-    refused(answer, 500, "internal")
+    read_faults(answer, 500, "internal")
     assert "inside" not in answer.text
 
 
@@ -153,4 +153,4 @@ def test_a_mistake_in_a_statement_is_not_told_as_a_database_that_is_away(
             raise OperationalError("SELECT", {}, error) from error
 
     monkeypatch.setattr(parts_of(server).database, "read_session", mistaken)
-    refused(server.get("/v1/jobs"), 500, "internal")
+    read_faults(server.get("/v1/jobs"), 500, "internal")

@@ -11,9 +11,8 @@ from typer.testing import CliRunner
 
 from service.cli import common, runs
 from service.client.client import Client
-from tests.identified import identified
-from tests.integration.rest.test_client import Through
-from tests.rest import parts_of, refused
+from tests.support.service.local_runs import identify_job
+from tests.support.service.web_app import Through, parts_of, read_faults
 
 STEP = {"kind": "step", "amplitude": 1.0}
 CONTROL = {"input": "u", "output": "y", "gain": 0.5, "integral_time": 1.0, "reference": STEP}
@@ -31,7 +30,7 @@ ARX = {
 }
 
 
-class Served(NamedTuple):
+class ControlledPlants(NamedTuple):
     """An application with an identified lag and an identified recursion."""
 
     server: TestClient
@@ -40,7 +39,7 @@ class Served(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def served(server: TestClient) -> Served:
+def plants(server: TestClient) -> ControlledPlants:
     found = []
     for model, values in (("fopdt", {**PLANT}), (ARX, {"a": 0.9, "b": 0.1})):
         made = server.post(
@@ -59,23 +58,25 @@ def served(server: TestClient) -> Served:
             "datasets": [made.json()["id"]],
             "algorithm": {"population": 16, "generations": 25, "islands": 1},
         }
-        _, [run] = identified(parts_of(server), body)
+        _, [run] = identify_job(parts_of(server), body)
         found.append(run)
-    return Served(server, *found)
+    return ControlledPlants(server, *found)
 
 
-def simulated(served: Served, run: str | None = None, **control: Any) -> dict[str, Any]:
+def simulate_control(
+    plants: ControlledPlants, run: str | None = None, **control: Any
+) -> dict[str, Any]:
     """The lag with its true parameters in a loop; other fields of the controller."""
     body: dict[str, Any] = {**BODY, "control": {**CONTROL, **control}}
     if run is None:
         body["parameters"] = PLANT
-    answer = served.server.post(f"/v1/runs/{run or served.lag}:simulate", json=body)
+    answer = plants.server.post(f"/v1/runs/{run or plants.lag}:simulate", json=body)
     assert answer.status_code == 200, answer.text
     return dict(answer.json())
 
 
-def test_a_pi_controller_leaves_no_error_and_its_numbers_are_told(served: Served) -> None:
-    found = simulated(served, upper=0.62, setpoint_weight=0.9)
+def test_a_pi_controller_leaves_no_error_and_its_numbers_are_told(plants: ControlledPlants) -> None:
+    found = simulate_control(plants, upper=0.62, setpoint_weight=0.9)
     assert found["metrics"]["steady_error"] == pytest.approx(0.0, abs=1e-4)
     assert found["controller"] == {
         "gain": 0.5,
@@ -95,15 +96,15 @@ def test_a_pi_controller_leaves_no_error_and_its_numbers_are_told(served: Served
     at_limit = np.mean(np.array(found["command"]["values"]) >= 0.62)
     assert found["controller"]["saturated_percent"] == pytest.approx(100 * at_limit, abs=0.5)
     assert found["tuning"] is None
-    proportional = simulated(served, integral_time=None)
+    proportional = simulate_control(plants, integral_time=None)
     # Of gain 0.5 and a plant of 2 half of the step is left.
     assert proportional["metrics"]["steady_error"] == pytest.approx(0.5, abs=1e-3)
     assert proportional["controller"]["integral_time"] is None
 
 
-def test_integrals_of_the_error_are_those_of_the_series(served: Served) -> None:
-    metrics = simulated(served)["metrics"]
-    whole = simulated(served)
+def test_integrals_of_the_error_are_those_of_the_series(plants: ControlledPlants) -> None:
+    metrics = simulate_control(plants)["metrics"]
+    whole = simulate_control(plants)
     times, values = (np.array(whole["outputs"][0][key]) for key in ("times", "values"))
     assert times.size == BODY["samples"]
     error = np.abs(1.0 - values)
@@ -113,19 +114,19 @@ def test_integrals_of_the_error_are_those_of_the_series(served: Served) -> None:
     assert metrics["iae"] == pytest.approx(1.0 / (0.5 * 2.0), rel=0.1)
 
 
-def test_margins_are_those_of_the_loop_and_a_recursion_has_none(served: Served) -> None:
-    found = simulated(served)["margins"]
+def test_margins_are_those_of_the_loop_and_a_recursion_has_none(plants: ControlledPlants) -> None:
+    found = simulate_control(plants)["margins"]
     assert found["is_stable"]
     assert found["gain_margin"] == pytest.approx(3.14, abs=0.01)
     assert found["phase_margin"] == pytest.approx(61.4, abs=0.1)
     assert found["delay_margin"] == pytest.approx(2.14 * 0.5, abs=0.01)
-    recursion = simulated(served, served.arx, gain=2.0)
+    recursion = simulate_control(plants, plants.arx, gain=2.0)
     assert recursion["margins"] is None
     assert recursion["metrics"]["steady_error"] == pytest.approx(0.0, abs=1e-4)
 
 
-def test_a_rule_chooses_the_numbers_and_says_whose_it_is(served: Served) -> None:
-    found = simulated(served, gain=None, integral_time=None, tuning={})
+def test_a_rule_chooses_the_numbers_and_says_whose_it_is(plants: ControlledPlants) -> None:
+    found = simulate_control(plants, gain=None, integral_time=None, tuning={})
     assert found["controller"]["gain"] == pytest.approx(0.5)
     assert found["controller"]["integral_time"] == pytest.approx(1.0)
     told = found["tuning"]
@@ -134,39 +135,39 @@ def test_a_rule_chooses_the_numbers_and_says_whose_it_is(served: Served) -> None
     assert told["process_gain"] == pytest.approx(2.0)
     assert "Skogestad" in told["reference"]
     assert told["formulas"]
-    by_hand = simulated(
-        served, gain=found["controller"]["gain"], integral_time=found["controller"]["integral_time"]
+    by_hand = simulate_control(
+        plants, gain=found["controller"]["gain"], integral_time=found["controller"]["integral_time"]
     )
     assert by_hand["outputs"] == found["outputs"]
-    slower = simulated(
-        served, gain=None, integral_time=None, tuning={"closed_loop_time_constant": 2.0}
+    slower = simulate_control(
+        plants, gain=None, integral_time=None, tuning={"closed_loop_time_constant": 2.0}
     )
     assert slower["controller"]["gain"] == pytest.approx(1.0 / (2.0 * 2.5))
     tube = {"time_constant": 0.4, "delay": 0.2}
-    pid = simulated(
-        served, gain=None, integral_time=None, transport=tube, tuning={"controller": "PID"}
+    pid = simulate_control(
+        plants, gain=None, integral_time=None, transport=tube, tuning={"controller": "PID"}
     )
     assert pid["tuning"]["process_second_time_constant"] == pytest.approx(0.4)
     assert pid["controller"]["derivative_time"] > 0
     assert pid["metrics"]["is_settled"]
-    amigo = simulated(served, gain=None, integral_time=None, tuning={"rule": "amigo"})
+    amigo = simulate_control(plants, gain=None, integral_time=None, tuning={"rule": "amigo"})
     assert "Åström" in amigo["tuning"]["reference"]
     assert amigo["tuning"]["closed_loop_time_constant"] is None
 
 
-def test_a_pid_rule_that_gives_no_derivative_says_why(served: Served) -> None:
-    found = simulated(served, gain=None, integral_time=None, tuning={"controller": "PID"})
+def test_a_pid_rule_that_gives_no_derivative_says_why(plants: ControlledPlants) -> None:
+    found = simulate_control(plants, gain=None, integral_time=None, tuning={"controller": "PID"})
     assert found["controller"]["derivative_time"] == 0.0
     assert any("no second time constant" in note for note in found["notes"])
 
 
-def test_an_unstable_loop_and_a_limit_cycle_are_told_plainly(served: Served) -> None:
-    wild = simulated(served, gain=3.0, integral_time=1.0)
+def test_an_unstable_loop_and_a_limit_cycle_are_told_plainly(plants: ControlledPlants) -> None:
+    wild = simulate_control(plants, gain=3.0, integral_time=1.0)
     assert wild["metrics"]["runs_away"]
     assert wild["metrics"]["settling_time"] is wild["metrics"]["iae"] is None
     assert not wild["margins"]["is_stable"]
     assert any("the loop is unstable" in note for note in wild["notes"])
-    bounded = simulated(served, gain=3.0, integral_time=1.0, limit=1.5)
+    bounded = simulate_control(plants, gain=3.0, integral_time=1.0, limit=1.5)
     metrics = bounded["metrics"]
     assert not metrics["runs_away"]
     assert metrics["settling_time"] is None
@@ -177,9 +178,11 @@ def test_an_unstable_loop_and_a_limit_cycle_are_told_plainly(served: Served) -> 
     assert not any("it decays" in note for note in bounded["notes"])
 
 
-def test_of_a_loop_that_is_hardly_stable_it_is_said_that_its_swing_decays(served: Served) -> None:
-    border = simulated(served, gain=1.0, integral_time=1.0)["margins"]["gain_margin"]
-    hardly = simulated(served, gain=0.999 * border, integral_time=1.0)
+def test_of_a_loop_that_is_hardly_stable_it_is_said_that_its_swing_decays(
+    plants: ControlledPlants,
+) -> None:
+    border = simulate_control(plants, gain=1.0, integral_time=1.0)["margins"]["gain_margin"]
+    hardly = simulate_control(plants, gain=0.999 * border, integral_time=1.0)
     assert hardly["margins"]["is_stable"]
     [note] = [one for one in hardly["notes"] if "oscillates and does not settle" in one]
     assert note.endswith(". By its transfer function it decays, but too slowly for this record")
@@ -215,73 +218,75 @@ def test_of_a_loop_that_is_hardly_stable_it_is_said_that_its_swing_decays(served
     ],
 )
 def test_what_cannot_control_is_told_where_it_is(
-    served: Served, change: dict[str, Any], pointer: str, part: str
+    plants: ControlledPlants, change: dict[str, Any], pointer: str, part: str
 ) -> None:
     body = {**BODY, "control": {**CONTROL, **change}, "parameters": PLANT}
-    faults = refused(
-        served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422, "invalid"
+    faults = read_faults(
+        plants.server.post(f"/v1/runs/{plants.lag}:simulate", json=body), 422, "invalid"
     )
     assert pointer in {fault["pointer"] for fault in faults}, faults
     assert any(part in fault["detail"] for fault in faults), faults
 
 
 def test_steps_that_are_too_long_for_a_stable_loop_are_not_blamed_on_its_gain(
-    served: Served,
+    plants: ControlledPlants,
 ) -> None:
-    assert simulated(served)["margins"]["is_stable"]
+    assert simulate_control(plants)["margins"]["is_stable"]
     body = {**BODY, "sample_time": 20, "control": CONTROL, "parameters": PLANT}
-    [fault] = refused(
-        served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422, "invalid"
+    [fault] = read_faults(
+        plants.server.post(f"/v1/runs/{plants.lag}:simulate", json=body), 422, "invalid"
     )
     assert fault["pointer"] == "/sample_time"
     assert "The loop is stable, but steps of 10 s are too long to simulate it" in fault["detail"]
     wild = {**body, "control": {**CONTROL, "gain": 1e30}}
-    [fault] = refused(
-        served.server.post(f"/v1/runs/{served.lag}:simulate", json=wild), 422, "invalid"
+    [fault] = read_faults(
+        plants.server.post(f"/v1/runs/{plants.lag}:simulate", json=wild), 422, "invalid"
     )
     assert fault["pointer"] == "/control/gain"
 
 
 @pytest.mark.parametrize("zero", [0, 0.0, -0.02])
-def test_a_sampling_period_of_zero_is_refused(served: Served, zero: float) -> None:
+def test_a_sampling_period_of_zero_is_refused(plants: ControlledPlants, zero: float) -> None:
     body = {**BODY, "sample_time": zero}
-    faults = refused(
-        served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422, "invalid"
+    faults = read_faults(
+        plants.server.post(f"/v1/runs/{plants.lag}:simulate", json=body), 422, "invalid"
     )
     assert [fault["pointer"] for fault in faults] == ["/sample_time"]
 
 
-def test_a_rule_for_a_recursion_or_without_dead_time_is_refused(served: Served) -> None:
+def test_a_rule_for_a_recursion_or_without_dead_time_is_refused(plants: ControlledPlants) -> None:
     control = {key: value for key, value in CONTROL.items() if key not in ("gain", "integral_time")}
     control["tuning"] = {}
-    path = f"/v1/runs/{served.arx}:simulate"
-    [fault] = refused(served.server.post(path, json={**BODY, "control": control}), 422, "invalid")
+    path = f"/v1/runs/{plants.arx}:simulate"
+    [fault] = read_faults(
+        plants.server.post(path, json={**BODY, "control": control}), 422, "invalid"
+    )
     assert fault["pointer"] == "/control/tuning"
     assert "this one is a recursion" in fault["detail"]
     body = {**BODY, "control": control, "parameters": {**PLANT, "L": 0.0}}
-    path = f"/v1/runs/{served.lag}:simulate"
-    [fault] = refused(served.server.post(path, json=body), 422, "invalid")
+    path = f"/v1/runs/{plants.lag}:simulate"
+    [fault] = read_faults(plants.server.post(path, json=body), 422, "invalid")
     assert fault["pointer"] == "/control/tuning/closed_loop_time_constant"
     assert "no dead time to use instead" in fault["detail"]
 
 
 def test_the_command_line_tells_controller_rule_and_margins(
-    served: Served, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    plants: ControlledPlants, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def connected(url: str, key: str | None) -> Client:
-        return Client("http://testserver", transport=Through(served.server))
+    def connect_in_process(url: str, key: str | None) -> Client:
+        return Client("http://testserver", transport=Through(plants.server))
 
-    monkeypatch.setattr(common, "connect_client", connected)
+    monkeypatch.setattr(common, "connect_client", connect_in_process)
     file = tmp_path / "loop.json"
 
-    def told(**control: Any) -> str:
+    def run_command(**control: Any) -> str:
         body = {**BODY, "parameters": PLANT, "control": {**CONTROL, **control}}
         file.write_text(json.dumps(body))
-        done = CliRunner().invoke(runs.app, ["simulate", served.lag, str(file)])
+        done = CliRunner().invoke(runs.app, ["simulate", plants.lag, str(file)])
         assert done.exit_code == 0, done.output
         return done.output
 
-    text = told(gain=None, integral_time=None, tuning={}, upper=0.62)
+    text = run_command(gain=None, integral_time=None, tuning={}, upper=0.62)
     for part in (
         "IAE: 1.",
         "ITAE: 0.",
@@ -293,6 +298,6 @@ def test_the_command_line_tells_controller_rule_and_margins(
         "phase margin 61.4°",
     ):
         assert part in text, text
-    text = told(gain=3.0, limit=1.5)
+    text = run_command(gain=3.0, limit=1.5)
     assert "oscillates and does not settle" in text
     assert "gain margin" not in text

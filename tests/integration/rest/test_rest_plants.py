@@ -12,27 +12,26 @@ from service.cli import common, datasets
 from service.client.client import Client
 from service.formats.mcap import read_mcap
 from sysid.data.records import Recording
-from tests.integration.rest.test_client import Through
-from tests.rest import refused
+from tests.support.service.web_app import Through, read_faults
 
 SUPPLY = {"P_a": {"kind": "binary", "amplitude": 12e3, "period": 0.2, "seed": 3}}
 ARM = {"plant": "actuator", "inputs": SUPPLY, "samples": 200, "sample_time": 0.01}
 TUBE = {"plant": "tube", "parameters": {"length_m": 20}, "samples": 400}
 
 
-def made(server: TestClient, body: dict[str, Any]) -> dict[str, Any]:
+def simulate_dataset(server: TestClient, body: dict[str, Any]) -> dict[str, Any]:
     answer = server.post("/v1/datasets:simulate", json=body)
     assert answer.status_code in (200, 201), answer.text
     return dict(answer.json())
 
 
-def content(server: TestClient, dataset: dict[str, Any]) -> Recording:
+def read_content(server: TestClient, dataset: dict[str, Any]) -> Recording:
     return read_mcap(server.get(f"/v1/datasets/{dataset['id']}/content").content)
 
 
 def test_the_actuator_is_made_once_and_tells_its_true_parameters(server: TestClient) -> None:
     body = {**ARM, "parameters": {"J": 4e-4, "k_a": 70.0}}
-    first, again = (made(server, body) for _ in range(2))
+    first, again = (simulate_dataset(server, body) for _ in range(2))
     assert first["id"] == again["id"]
     assert [c["name"] for c in first["channels"]] == ["P_a", "theta", "P"]
     true = first["details"]["true_parameters"]
@@ -40,8 +39,10 @@ def test_the_actuator_is_made_once_and_tells_its_true_parameters(server: TestCli
 
 
 def test_noise_is_on_the_angle_alone(server: TestClient) -> None:
-    clean = content(server, made(server, ARM))
-    noisy = content(server, made(server, {**ARM, "noise": {"sigma": 1e-3, "seed": 2}}))
+    clean = read_content(server, simulate_dataset(server, ARM))
+    noisy = read_content(
+        server, simulate_dataset(server, {**ARM, "noise": {"sigma": 1e-3, "seed": 2}})
+    )
     for name in ("P_a", "P"):
         np.testing.assert_array_equal(clean.channel(name).values, noisy.channel(name).values)
     error = noisy.channel("theta").values - clean.channel("theta").values
@@ -49,13 +50,13 @@ def test_noise_is_on_the_angle_alone(server: TestClient) -> None:
 
 
 def test_the_tube_has_a_record_of_its_own_length_and_sampling(server: TestClient) -> None:
-    short = made(server, {"plant": "tube", "parameters": {"length_m": 5, "pattern": 2}})
+    short = simulate_dataset(server, {"plant": "tube", "parameters": {"length_m": 5, "pattern": 2}})
     assert (short["samples"], short["sample_time"]) == (15001, 0.002)
-    some = made(server, TUBE)
+    some = simulate_dataset(server, TUBE)
     assert (some["samples"], some["sample_time"]) == (400, 0.01)
     assert [(c["name"], c["unit"]) for c in some["channels"]] == [("P1", "Pa"), ("P2", "Pa")]
-    gauged = made(server, {**TUBE, "parameters": {"length_m": 20, "gauges": 1}})
-    values = content(server, gauged).channel("P2").values / (1e6 / 4096)
+    gauged = simulate_dataset(server, {**TUBE, "parameters": {"length_m": 20, "gauges": 1}})
+    values = read_content(server, gauged).channel("P2").values / (1e6 / 4096)
     np.testing.assert_allclose(values, np.round(values), atol=1e-9)
 
 
@@ -117,7 +118,7 @@ def test_the_tube_has_a_record_of_its_own_length_and_sampling(server: TestClient
 def test_a_plant_that_cannot_be_is_told_where_it_is(
     server: TestClient, body: dict[str, Any], pointer: str, part: str
 ) -> None:
-    faults = refused(server.post("/v1/datasets:simulate", json=body), 422, "invalid")
+    faults = read_faults(server.post("/v1/datasets:simulate", json=body), 422, "invalid")
     assert pointer in {fault["pointer"] for fault in faults}, faults
     assert any(part in fault["detail"] for fault in faults), faults
 

@@ -9,8 +9,8 @@ from service.core.states import JobState
 from service.jobs.stored_run import StoredRun
 from service.storage.tables import Job, Run
 from sysid.models.parse import keep_terms, parse_model
-from tests.polynomials import document, frols
-from tests.rest import recording, refused, store_csv
+from tests.support.library.polynomials import document, frols
+from tests.support.service.web_app import read_faults, recording, store_csv
 
 
 def job(server: TestClient, dataset: str, terms: Any, **changes: Any) -> Any:
@@ -42,14 +42,14 @@ def test_a_rule_with_faults_is_refused_where_they_are(
 ) -> None:
     found = {
         one["pointer"]: one["detail"]
-        for one in refused(job(server, dataset, terms), 422, "invalid")
+        for one in read_faults(job(server, dataset, terms), 422, "invalid")
     }
     assert part in found[place]
 
 
 def test_more_candidates_than_samples_are_refused_when_the_job_is_sent(server: TestClient) -> None:
     few = store_csv(server, recording(n=12), "few")
-    (fault,) = refused(job(server, few, frols(3)), 422, "invalid")
+    (fault,) = read_faults(job(server, few, frols(3)), 422, "invalid")
     assert fault["pointer"] == "/model/terms"
     assert "14 candidates cannot be distinguished with 12 samples" in fault["detail"]
 

@@ -10,9 +10,8 @@ import service.runs.profiles
 from service.cli import common
 from service.cli.runs import app as runs_app
 from service.client.client import Client
-from tests.identified import ServedRun, serve_run
-from tests.integration.rest.test_client import Through
-from tests.rest import refused
+from tests.support.service.local_runs import ServedRun, serve_run
+from tests.support.service.web_app import Through, read_faults
 
 SMALL = {"population": 20, "generations": 60, "islands": 1}
 MODEL: dict[str, Any] = {
@@ -29,7 +28,7 @@ MODEL: dict[str, Any] = {
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedRun]:
+def served_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedRun]:
     changes = {
         "model": MODEL,
         "algorithm": SMALL,
@@ -41,14 +40,14 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedRun]:
         yield run
 
 
-def result(served: ServedRun) -> dict[str, Any]:
-    document: dict[str, Any] = served.server.get(f"/v1/runs/{served.run}").json()
+def read_result(served_run: ServedRun) -> dict[str, Any]:
+    document: dict[str, Any] = served_run.server.get(f"/v1/runs/{served_run.run}").json()
     assert document["state"] == "succeeded", document["error"]
     return document
 
 
-def test_groups_ties_and_criteria_are_in_the_result(served: ServedRun) -> None:
-    document = result(served)
+def test_groups_ties_and_criteria_are_in_the_result(served_run: ServedRun) -> None:
+    document = read_result(served_run)
     (group,) = document["identifiability"]["groups"]
     assert group["expression"] == "k*A/J"
     assert group["members"] == ["k", "A", "J"]
@@ -67,8 +66,8 @@ def test_groups_ties_and_criteria_are_in_the_result(served: ServedRun) -> None:
     assert document["criteria"]["parameters"] == 4
 
 
-def test_the_minima_and_whether_the_search_settled_are_in_the_result(served: ServedRun) -> None:
-    document = served.server.get(f"/v1/runs/{served.run}").json()
+def test_the_minima_and_whether_the_search_settled_are_in_the_result(served_run: ServedRun) -> None:
+    document = served_run.server.get(f"/v1/runs/{served_run.run}").json()
     search = document["search"]
     assert search["settled"] is (search["because"] is not None)
     assert 0 <= search["agreeing_starts"] <= search["independent_starts"]
@@ -77,17 +76,17 @@ def test_the_minima_and_whether_the_search_settled_are_in_the_result(served: Ser
     assert set(lowest["parameters"]) <= set(values)
     assert (lowest["likelihood_ratio"], lowest["is_compatible"]) == (0.0, True)
     assert lowest["rms"] == pytest.approx(document["rms"], rel=1e-3)
-    page = served.server.get(f"/runs/{served.run}", headers={"accept": "text/html"}).text
+    page = served_run.server.get(f"/runs/{served_run.run}", headers={"accept": "text/html"}).text
     assert "independent starts ended here" in page
-    history = served.server.get(f"/v1/runs/{served.run}/history").json()
+    history = served_run.server.get(f"/v1/runs/{served_run.run}/history").json()
     assert history["names"] == ["k", "A", "J", "L"]
 
 
-def test_a_profile_has_the_interval_and_its_figure(served: ServedRun) -> None:
+def test_a_profile_has_the_interval_and_its_figure(served_run: ServedRun) -> None:
     body = {"parameters": ["L"], "points": 9}
-    answer = served.server.post(f"/v1/runs/{served.run}:profile", json=body).json()
+    answer = served_run.server.post(f"/v1/runs/{served_run.run}:profile", json=body).json()
     (one,) = answer["profiles"]
-    estimate = next(e for e in result(served)["parameters"] if e["name"] == "L")
+    estimate = next(e for e in read_result(served_run)["parameters"] if e["name"] == "L")
     low, high = one["interval95"]
     assert low < estimate["value"] < high
     assert one["estimate"] == pytest.approx(estimate["value"])
@@ -102,37 +101,39 @@ def test_a_profile_has_the_interval_and_its_figure(served: ServedRun) -> None:
     assert trace["y"] == one["ratio"]
 
 
-def test_a_member_of_a_group_has_an_open_profile(served: ServedRun) -> None:
+def test_a_member_of_a_group_has_an_open_profile(served_run: ServedRun) -> None:
     body = {"parameters": ["J"], "points": 5}
-    answer = served.server.post(f"/v1/runs/{served.run}:profile", json=body).json()
+    answer = served_run.server.post(f"/v1/runs/{served_run.run}:profile", json=body).json()
     assert answer["profiles"][0]["interval95"] == [None, None]
 
 
 def test_a_profile_that_cannot_be_had_is_refused(
-    served: ServedRun, monkeypatch: pytest.MonkeyPatch
+    served_run: ServedRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    url = f"/v1/runs/{served.run}:profile"
-    fault = refused(served.server.post(url, json={"parameters": ["LL"]}), 422, "invalid")[0]
+    url = f"/v1/runs/{served_run.run}:profile"
+    fault = read_faults(served_run.server.post(url, json={"parameters": ["LL"]}), 422, "invalid")[0]
     assert fault["pointer"] == "/parameters/0"
     assert "did you mean 'L'?" in fault["detail"]
-    fault = refused(served.server.post(url, json={"points": 2}), 422, "invalid")[0]
+    fault = read_faults(served_run.server.post(url, json={"points": 2}), 422, "invalid")[0]
     assert fault["pointer"] == "/points"
-    refused(served.server.post("/v1/runs/run_0:profile", json={}), 404, "not-found")
+    read_faults(served_run.server.post("/v1/runs/run_0:profile", json={}), 404, "not-found")
     monkeypatch.setattr(service.runs.profiles, "LIMIT_SECONDS", -1.0)
-    fault = refused(served.server.post(url, json={"parameters": ["L"]}), 422, "invalid")[0]
+    fault = read_faults(served_run.server.post(url, json={"parameters": ["L"]}), 422, "invalid")[0]
     assert "were stopped at 'L'" in fault["detail"]
     monkeypatch.setattr(service.runs.profiles, "MAX_WORK", 10)
-    fault = refused(served.server.post(url, json={}), 422, "invalid")[0]
+    fault = read_faults(served_run.server.post(url, json={}), 422, "invalid")[0]
     assert "need at most 10" in fault["detail"]
 
 
-def test_the_command_tells_intervals(served: ServedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_tells_intervals(
+    served_run: ServedRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(
         common,
         "connect_client",
-        lambda *_: Client("http://testserver", transport=Through(served.server)),
+        lambda *_: Client("http://testserver", transport=Through(served_run.server)),
     )
-    told = CliRunner().invoke(runs_app, ["profile", served.run, "L", "--points", "7"])
+    told = CliRunner().invoke(runs_app, ["profile", served_run.run, "L", "--points", "7"])
     assert told.exit_code == 0, told.output
     assert "estimate" in told.output
     assert "L" in told.output

@@ -11,7 +11,8 @@ from service.cli import common
 from service.cli import reidentify as reidentifying
 from service.cli.main import build_program
 from service.client.client import Client
-from tests.batches import (
+from tests.support.service.local_runs import carry_out_job
+from tests.support.service.tube_batch import (
     BODY,
     LENGTHS,
     ServedBatch,
@@ -19,18 +20,16 @@ from tests.batches import (
     make_recording,
     store_tube,
 )
-from tests.identified import carried_out
-from tests.integration.rest.test_client import Through
-from tests.rest import refused
+from tests.support.service.web_app import Through, read_faults
 
 
-def trend(served_batch: ServedBatch, job: str) -> dict[str, Any]:
+def read_trend(served_batch: ServedBatch, job: str) -> dict[str, Any]:
     answer = served_batch.server.get(f"/v1/jobs/{job}/trend")
     assert answer.status_code == 200, answer.text
     return dict(answer.json())
 
 
-def quantity(found: dict[str, Any], name: str) -> dict[str, Any]:
+def find_quantity(found: dict[str, Any], name: str) -> dict[str, Any]:
     return next(dict(one) for one in found["quantities"] if one["name"] == name)
 
 
@@ -39,17 +38,17 @@ def chosen(one: dict[str, Any]) -> dict[str, Any]:
 
 
 def run_at(served_batch: ServedBatch, job: str, x: float) -> str:
-    place = next(one for one in trend(served_batch, job)["labels"] if one["x"] == x)
+    place = next(one for one in read_trend(served_batch, job)["labels"] if one["x"] == x)
     return str(place["runs"][0])
 
 
 def test_a_batch_gives_each_length_in_order_with_errors_onset_and_span(
     served_batch: ServedBatch,
 ) -> None:
-    found = trend(served_batch, served_batch.job)
+    found = read_trend(served_batch, served_batch.job)
     assert [one["x"] for one in found["labels"]] == list(LENGTHS)
     assert [one["name"] for one in found["quantities"]] == ["L", "T", "onset delay"]
-    for point in quantity(found, "L")["points"]:
+    for point in find_quantity(found, "L")["points"]:
         true = 0.02 + 0.01 * point["x"]
         assert abs(point["value"] - true) < 5 * point["stderr"]
         assert point["stderr"] > 0
@@ -70,8 +69,8 @@ def test_runs_begin_at_their_neighbours(served_batch: ServedBatch) -> None:
 
 
 def test_the_laws_are_those_of_the_tube_and_predictions_hold(served_batch: ServedBatch) -> None:
-    found = trend(served_batch, served_batch.job)
-    delay, constant = quantity(found, "L"), quantity(found, "T")
+    found = read_trend(served_batch, served_batch.job)
+    delay, constant = find_quantity(found, "L"), find_quantity(found, "T")
     assert chosen(delay)["law"] == "line"
     slope = chosen(delay)["coefficients"][1]
     assert slope["value"] == pytest.approx(0.01, abs=4 * slope["stderr"])
@@ -86,13 +85,13 @@ def test_the_laws_are_those_of_the_tube_and_predictions_hold(served_batch: Serve
 
 def test_experiments_of_one_length_are_fitted_together_or_pooled(served_batch: ServedBatch) -> None:
     both = [{"x": x, "datasets": served_batch.datasets[x]} for x in LENGTHS]
-    jointly = trend(served_batch, identify_batch(served_batch.server, batch=both))
-    assert quantity(jointly, "L")["between_runs"] is None
+    jointly = read_trend(served_batch, identify_batch(served_batch.server, batch=both))
+    assert find_quantity(jointly, "L")["between_runs"] is None
     apart = [{"x": x, "datasets": [one]} for x in LENGTHS for one in served_batch.datasets[x]]
-    pooled = trend(served_batch, identify_batch(served_batch.server, batch=apart))
-    assert quantity(pooled, "L")["between_runs"] > 0
+    pooled = read_trend(served_batch, identify_batch(served_batch.server, batch=apart))
+    assert find_quantity(pooled, "L")["between_runs"] > 0
     for one, two in zip(
-        quantity(jointly, "L")["points"], quantity(pooled, "L")["points"], strict=True
+        find_quantity(jointly, "L")["points"], find_quantity(pooled, "L")["points"], strict=True
     ):
         assert len(two["runs"]) == 2
         assert one["value"] == pytest.approx(two["value"], abs=4 * two["stderr"])
@@ -111,18 +110,18 @@ def test_an_unchanged_batch_does_not_drift_and_a_changed_length_does(
         reference="tube",
         batch=[*batch, {"x": 8.0, "datasets": [changed]}],
     )
-    found = trend(served_batch, job)
+    found = read_trend(served_batch, job)
     assert (found["reference"], found["reference_x"]) == (reference, 8.0)
     drifted = {
         (point["x"], drift["kind"])
-        for point in quantity(found, "L")["points"]
+        for point in find_quantity(found, "L")["points"]
         for drift in point["drifts"]
         if drift["drifted"]
     }
     assert drifted == {(8.0, "run"), (8.0, "trend")}
     (against_run,) = (
         one
-        for point in quantity(found, "L")["points"]
+        for point in find_quantity(found, "L")["points"]
         for one in point["drifts"]
         if one["kind"] == "run"
     )
@@ -144,7 +143,7 @@ def test_references_keep_their_history_and_say_what_is_wrong(served_batch: Serve
         one["name"] for one in served_batch.server.get("/v1/references").json()["items"]
     ]
     wrong = served_batch.server.put("/v1/references/kept", json={"run": "run_none"})
-    assert refused(wrong, 422, "invalid")[0]["pointer"] == "/run"
+    assert read_faults(wrong, 422, "invalid")[0]["pointer"] == "/run"
     missing = served_batch.server.get("/v1/references/kep")
     assert missing.status_code == 404
     assert "did you mean 'kept'" in missing.json()["detail"]
@@ -158,7 +157,7 @@ def test_every_unknown_dataset_of_a_batch_is_told_at_its_entry(served_batch: Ser
         {"x": 4, "datasets": ["ds_d"]},
     ]
     answer = served_batch.server.post("/v1/recipes/reidentify", json={**BODY, "batch": batch})
-    faults = refused(answer, 422, "invalid")
+    faults = read_faults(answer, 422, "invalid")
     assert {
         (one["pointer"][:17], named)
         for one in faults
@@ -187,7 +186,7 @@ def test_a_name_that_means_something_else_is_refused_at_the_path(
 ) -> None:
     run = run_at(served_batch, served_batch.job, 2.0)
     path = f"/v1/references/{quote(name, safe='')}".replace("..", "%2E%2E")
-    (fault,) = refused(served_batch.server.put(path, json={"run": run}), 422, "invalid")
+    (fault,) = read_faults(served_batch.server.put(path, json={"run": run}), 422, "invalid")
     assert fault["pointer"] == "{name}"
     assert "the name in the path is" in fault["detail"]
     assert "need" in fault["detail"]
@@ -207,7 +206,7 @@ def test_references_are_paged_and_a_new_note_is_kept(served_batch: ServedBatch) 
     assert [one["note"] for one in told["history"]] == ["first"]
     client = Client("http://testserver", transport=Through(served_batch.server))
     assert {"p1", "p2", "p3"} <= {one["name"] for one in client.references()}
-    refused(served_batch.server.get("/v1/references?limit=0"), 422, "invalid")
+    read_faults(served_batch.server.get("/v1/references?limit=0"), 422, "invalid")
 
 
 @pytest.mark.parametrize(
@@ -230,7 +229,7 @@ def test_a_fault_is_told_at_its_place_in_the_recipe(
     answer = served_batch.server.post(
         "/v1/recipes/reidentify", json={**BODY, "batch": batch, **fields}
     )
-    faults = refused(answer, 422, "invalid")
+    faults = read_faults(answer, 422, "invalid")
     assert pointer in faults[0]["pointer"]
     assert said in json.dumps(faults)
 
@@ -256,16 +255,16 @@ def test_labels_missing_for_a_trend_are_told(
         "sweep": {"axes": [axis]},
         "trend": {"x": "length_m"},
     }
-    (fault,) = refused(served_batch.server.post("/v1/jobs", json=body), 422, "invalid")
+    (fault,) = read_faults(served_batch.server.post("/v1/jobs", json=body), 422, "invalid")
     assert fault["pointer"] == pointer
     assert said in fault["detail"]
 
 
 def test_a_trend_of_too_few_lengths_says_how_many_it_needs(served_batch: ServedBatch) -> None:
     batch = [{"x": x, "datasets": served_batch.datasets[x][:1]} for x in LENGTHS[:2]]
-    found = trend(served_batch, identify_batch(served_batch.server, batch=batch))
-    assert quantity(found, "L")["laws"] == []
-    assert "needs 3" in quantity(found, "L")["reason"]
+    found = read_trend(served_batch, identify_batch(served_batch.server, batch=batch))
+    assert find_quantity(found, "L")["laws"] == []
+    assert "needs 3" in find_quantity(found, "L")["reason"]
 
 
 def test_lengths_that_no_law_can_hold_are_told_and_the_page_is_shown(
@@ -275,14 +274,14 @@ def test_lengths_that_no_law_can_hold_are_told_and_the_page_is_shown(
     recordings = [served_batch.datasets[x][:1] for x in LENGTHS]
     batch = [{"x": x, "datasets": one} for x, one in zip(sizes, recordings, strict=True)]
     job = identify_batch(served_batch.server, batch=batch)
-    assert [one["x"] for one in trend(served_batch, job)["labels"]] == list(sizes)
+    assert [one["x"] for one in read_trend(served_batch, job)["labels"]] == list(sizes)
     assert served_batch.server.get(f"/jobs/{job}").status_code == 200
 
 
 def test_a_job_without_a_trend_says_so(served_batch: ServedBatch) -> None:
     body = {"model": "tube", "datasets": served_batch.datasets[2.0]}
     job = served_batch.server.post("/v1/jobs", json=body).json()["id"]
-    refused(served_batch.server.get(f"/v1/jobs/{job}/trend"), 409, "conflict")
+    read_faults(served_batch.server.get(f"/v1/jobs/{job}/trend"), 409, "conflict")
     figure = served_batch.server.get(f"/v1/jobs/{job}/figures/trend").json()
     assert figure["data"] == []
 
@@ -298,7 +297,7 @@ def test_figure_page_and_report_show_the_trend(served_batch: ServedBatch) -> Non
         assert served_batch.server.get(
             f"/v1/jobs/{served_batch.job}/{path}", params=query
         ).is_success
-        refused(
+        read_faults(
             served_batch.server.get(f"/v1/jobs/{served_batch.job}/{path}?outliers=some"),
             422,
             "invalid",
@@ -314,14 +313,14 @@ def test_figure_page_and_report_show_the_trend(served_batch: ServedBatch) -> Non
 def command(served_batch: ServedBatch, monkeypatch: pytest.MonkeyPatch) -> CliRunner:
     """The command line against this server; jobs are carried out while it waits."""
 
-    def connected(*_: object) -> Client:
+    def connect_in_process(*_: object) -> Client:
         return Client("http://testserver", transport=Through(served_batch.server))
 
     def follow(opened: Client, job: str, *, quiet: bool = False) -> dict[str, Any]:
-        carried_out(served_batch.parts, job)
+        carry_out_job(served_batch.parts, job)
         return opened.job(job)
 
-    monkeypatch.setattr(common, "connect_client", connected)
+    monkeypatch.setattr(common, "connect_client", connect_in_process)
     monkeypatch.setattr(f"{reidentifying.__name__}.follow_job", follow)
     return CliRunner()
 

@@ -21,9 +21,8 @@ from service.datasets import recordings
 from service.storage.errors import ObjectMissing
 from service.storage.objects import ObjectStore
 from sysid.data.records import Recording
-from tests.identified import identified
-from tests.integration.rest.test_client import Through
-from tests.rest import awaited, parts_of, refused, store_csv
+from tests.support.service.local_runs import identify_job
+from tests.support.service.web_app import Through, await_in_thread, parts_of, read_faults, store_csv
 
 N, STEP, NOISE = 500, 0.05, 0.02
 SMALL = {"population": 20, "generations": 40, "islands": 1}
@@ -47,7 +46,7 @@ TWO_OUTPUTS = {
 }
 
 
-class Served(NamedTuple):
+class ResidualFits(NamedTuple):
     """An application with a job of two models on the same data, and one on other data."""
 
     server: TestClient
@@ -57,7 +56,7 @@ class Served(NamedTuple):
     other: str
 
 
-def recording(seed: int) -> bytes:
+def make_recording(seed: int) -> bytes:
     """CSV of two equal lags behind a dead time of 0.4 s, with white noise."""
     draw = np.random.default_rng(seed)
     u = np.repeat(draw.choice([0.0, 1.0], N // 50), 50)
@@ -74,8 +73,8 @@ def recording(seed: int) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def served(server: TestClient) -> Served:
-    data = [store_csv(server, recording(k), f"d{k}") for k in (1, 2)]
+def fits(server: TestClient) -> ResidualFits:
+    data = [store_csv(server, make_recording(k), f"d{k}") for k in (1, 2)]
     parts = parts_of(server)
     body = {
         "model": "fopdt",
@@ -86,21 +85,21 @@ def served(server: TestClient) -> Served:
         "validation": {"fraction": 0.3},
     }
     models = {"axes": [{"path": "/model", "values": ["fopdt", "sopdt"]}]}
-    _, runs = identified(parts, {**body, "sweep": models})
-    _, other = identified(parts, {**body, "datasets": data[1:]})
-    return Served(server, parts, data[0], runs, other[0])
+    _, runs = identify_job(parts, {**body, "sweep": models})
+    _, other = identify_job(parts, {**body, "datasets": data[1:]})
+    return ResidualFits(server, parts, data[0], runs, other[0])
 
 
-def result(served: Served, run: str) -> dict[str, Any]:
-    document: dict[str, Any] = served.server.get(f"/v1/runs/{run}").json()
+def read_result(fits: ResidualFits, run: str) -> dict[str, Any]:
+    document: dict[str, Any] = fits.server.get(f"/v1/runs/{run}").json()
     assert document["state"] == "succeeded", document["error"]
     return document
 
 
-def assert_as_stored(served: Served, run: str, data: str) -> None:
+def assert_as_stored(fits: ResidualFits, run: str, data: str) -> None:
     """The functions of a run are those of the verdicts that were stored with it."""
-    stored = result(served, run)["residual_tests"]
-    asked = served.server.get(f"/v1/runs/{run}/residuals").json()
+    stored = read_result(fits, run)["residual_tests"]
+    asked = fits.server.get(f"/v1/runs/{run}/residuals").json()
     assert asked["passed"] == stored["passed"]
     assert asked["data"] == stored["data"] == data
     assert asked["note"] == ""
@@ -114,65 +113,67 @@ def assert_as_stored(served: Served, run: str, data: str) -> None:
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_functions_that_are_asked_for_have_the_verdicts_that_were_stored(
-    served: Served, number: int
+    fits: ResidualFits, number: int
 ) -> None:
-    assert_as_stored(served, served.runs[number], "validation")
+    assert_as_stored(fits, fits.runs[number], "validation")
 
 
-def test_under_a_noise_model_they_are_of_the_whitened_residuals(served: Served) -> None:
+def test_under_a_noise_model_they_are_of_the_whitened_residuals(fits: ResidualFits) -> None:
     body = {
         "model": "fopdt",
-        "datasets": [served.dataset],
+        "datasets": [fits.dataset],
         "hold": {"u": "zero"},
         "algorithm": SMALL,
         "parameters": BOUNDS,
         "loss": {"noise_model": "ar1"},
     }
-    _, (run,) = identified(served.parts, body)
-    assert result(served, run)["correlation_times"]["y"] > STEP
-    assert_as_stored(served, run, "estimation")
-    faults = refused(
-        served.server.post(f"/v1/runs/{run}:profile", json={"parameters": ["L"]}), 422, "invalid"
+    _, (run,) = identify_job(fits.parts, body)
+    assert read_result(fits, run)["correlation_times"]["y"] > STEP
+    assert_as_stored(fits, run, "estimation")
+    faults = read_faults(
+        fits.server.post(f"/v1/runs/{run}:profile", json={"parameters": ["L"]}), 422, "invalid"
     )
     assert faults[0]["pointer"] == "/loss/noise_model"
     assert "plain squares" in faults[0]["detail"]
     refusals = [{"prediction": "one-step"}, {"loss": {"kind": "soft-l1", "noise_model": "ar1"}}]
     for change in refusals:
-        (fault,) = refused(served.server.post("/v1/jobs", json={**body, **change}), 422, "invalid")
+        (fault,) = read_faults(
+            fits.server.post("/v1/jobs", json={**body, **change}), 422, "invalid"
+        )
         assert fault["pointer"] == "/loss/noise_model"
 
 
-def test_the_true_structure_passes_and_a_simpler_one_fails(served: Served) -> None:
-    fopdt, sopdt = (result(served, run)["residual_tests"] for run in served.runs)
+def test_the_true_structure_passes_and_a_simpler_one_fails(fits: ResidualFits) -> None:
+    fopdt, sopdt = (read_result(fits, run)["residual_tests"] for run in fits.runs)
     assert fopdt["passed"] is False
     assert sopdt["passed"] is True
 
 
-def test_the_onset_delay_is_that_of_the_measurement_whatever_the_model(served: Served) -> None:
-    first, second = (result(served, run)["onset_delays"] for run in served.runs)
+def test_the_onset_delay_is_that_of_the_measurement_whatever_the_model(fits: ResidualFits) -> None:
+    first, second = (read_result(fits, run)["onset_delays"] for run in fits.runs)
     assert first == second
     assert first[0]["output"] == "y"
     assert first[0]["unit"] == "s"
     assert 0.4 < first[0]["delay"] < 0.6  # behind the dead time two lags hesitate
 
 
-def test_a_run_without_signals_has_no_residuals(served: Served) -> None:
-    body = {"model": "fopdt", "datasets": [served.dataset]}
-    job = served.server.post("/v1/jobs", json=body).json()["id"]
-    run = served.server.get(f"/v1/jobs/{job}/runs").json()["items"][0]["id"]
-    refused(served.server.get(f"/v1/runs/{run}/residuals"), 404, "not-found")
-    faults = refused(
-        served.server.post("/v1/runs:compare", json={"runs": [run, served.runs[0]]}), 422, "invalid"
+def test_a_run_without_signals_has_no_residuals(fits: ResidualFits) -> None:
+    body = {"model": "fopdt", "datasets": [fits.dataset]}
+    job = fits.server.post("/v1/jobs", json=body).json()["id"]
+    run = fits.server.get(f"/v1/jobs/{job}/runs").json()["items"][0]["id"]
+    read_faults(fits.server.get(f"/v1/runs/{run}/residuals"), 404, "not-found")
+    faults = read_faults(
+        fits.server.post("/v1/runs:compare", json={"runs": [run, fits.runs[0]]}), 422, "invalid"
     )
     assert faults[0]["pointer"] == "/runs/0"
     assert "queued" in faults[0]["detail"]
 
 
 def test_a_comparison_has_the_better_model_first_and_flags_what_depends_on_it(
-    served: Served,
+    fits: ResidualFits,
 ) -> None:
-    client = Client("http://testserver", transport=Through(served.server))
-    found = client.compare(*served.runs)
+    client = Client("http://testserver", transport=Through(fits.server))
+    found = client.compare(*fits.runs)
     assert [one["model"] for one in found["runs"]] == ["sopdt", "fopdt"]
     better, worse = found["runs"]
     assert better["rms"] < worse["rms"]
@@ -182,12 +183,12 @@ def test_a_comparison_has_the_better_model_first_and_flags_what_depends_on_it(
     lag = next(one for one in found["parameters"] if one["name"] == "L")
     assert lag["differs"]
     assert any(note.startswith("L depends on the model: ") for note in found["notes"])
-    assert client.residuals(served.runs[0])["id"] == served.runs[0]
+    assert client.residuals(fits.runs[0])["id"] == fits.runs[0]
 
 
-def test_runs_on_other_data_do_not_compare(served: Served) -> None:
-    answer = served.server.post("/v1/runs:compare", json={"runs": [served.runs[0], served.other]})
-    faults = refused(answer, 422, "invalid")
+def test_runs_on_other_data_do_not_compare(fits: ResidualFits) -> None:
+    answer = fits.server.post("/v1/runs:compare", json={"runs": [fits.runs[0], fits.other]})
+    faults = read_faults(answer, 422, "invalid")
     assert faults[0]["pointer"] == "/runs/1"
     assert "other datasets" in faults[0]["detail"]
 
@@ -196,32 +197,34 @@ def test_runs_on_other_data_do_not_compare(served: Served) -> None:
     ("runs", "expected"),
     [(["run_x", "run_y"], "run_x"), (["a"], "at least 2"), ([], "at least 2")],
 )
-def test_a_comparison_of_nothing_is_refused(served: Served, runs: list[str], expected: str) -> None:
-    faults = refused(served.server.post("/v1/runs:compare", json={"runs": runs}), 422, "invalid")
+def test_a_comparison_of_nothing_is_refused(
+    fits: ResidualFits, runs: list[str], expected: str
+) -> None:
+    faults = read_faults(fits.server.post("/v1/runs:compare", json={"runs": runs}), 422, "invalid")
     assert expected in faults[0]["detail"]
 
 
-def test_a_run_is_not_compared_with_itself(served: Served) -> None:
-    twice = [served.runs[0], served.runs[0]]
-    faults = refused(served.server.post("/v1/runs:compare", json={"runs": twice}), 422, "invalid")
+def test_a_run_is_not_compared_with_itself(fits: ResidualFits) -> None:
+    twice = [fits.runs[0], fits.runs[0]]
+    faults = read_faults(fits.server.post("/v1/runs:compare", json={"runs": twice}), 422, "invalid")
     assert "named twice" in faults[0]["detail"]
 
 
 def test_where_the_inputs_are_lost_whiteness_is_told_all_the_same(
-    served: Served, monkeypatch: pytest.MonkeyPatch
+    fits: ResidualFits, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def lost(store: ObjectStore, sha256: str) -> Recording:
         raise ObjectMissing(sha256)
 
     monkeypatch.setattr(recordings, "load_recording", lost)
-    asked = served.server.get(f"/v1/runs/{served.runs[0]}/residuals").json()
+    asked = fits.server.get(f"/v1/runs/{fits.runs[0]}/residuals").json()
     assert [one["test"] for one in asked["tests"]] == ["whiteness"]
     assert "cannot be read any more" in asked["note"]
 
 
-def command(served: Served, monkeypatch: pytest.MonkeyPatch, *words: str, ends: int = 0) -> str:
+def command(fits: ResidualFits, monkeypatch: pytest.MonkeyPatch, *words: str, ends: int = 0) -> str:
     """What a command under ``lagid runs`` prints."""
-    client = Client("http://testserver", transport=Through(served.server))
+    client = Client("http://testserver", transport=Through(fits.server))
     monkeypatch.setattr(common, "connect_client", lambda url, key: nullcontext(client))
     done = CliRunner().invoke(runs_app, list(words))
     assert done.exit_code == ends, done.output
@@ -229,64 +232,64 @@ def command(served: Served, monkeypatch: pytest.MonkeyPatch, *words: str, ends: 
 
 
 def test_the_command_line_tells_the_verdicts(
-    served: Served, monkeypatch: pytest.MonkeyPatch
+    fits: ResidualFits, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = command(served, monkeypatch, "residuals", served.runs[0])
+    text = command(fits, monkeypatch, "residuals", fits.runs[0])
     assert "residuals on validation data: failed" in text
     assert "independence" in text
-    asked = json.loads(command(served, monkeypatch, "residuals", served.runs[1], "--json"))
+    asked = json.loads(command(fits, monkeypatch, "residuals", fits.runs[1], "--json"))
     assert asked["passed"] is True
 
 
 def test_the_command_line_compares_and_says_what_depends_on_the_model(
-    served: Served, monkeypatch: pytest.MonkeyPatch
+    fits: ResidualFits, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = command(served, monkeypatch, "compare", *served.runs)
+    text = command(fits, monkeypatch, "compare", *fits.runs)
     assert text.index("sopdt") < text.index("fopdt")
     assert "note: L depends on the model" in text
 
 
 def test_the_command_line_says_what_of_its_own_words_does_not_compare(
-    served: Served, monkeypatch: pytest.MonkeyPatch
+    fits: ResidualFits, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    alone = command(served, monkeypatch, "compare", served.runs[0], ends=1)
+    alone = command(fits, monkeypatch, "compare", fits.runs[0], ends=1)
     assert alone.startswith("lagid: RUN: found")
-    unknown = command(served, monkeypatch, "compare", served.runs[0], "run_x", ends=1)
+    unknown = command(fits, monkeypatch, "compare", fits.runs[0], "run_x", ends=1)
     assert "--set" not in unknown
 
 
-def test_the_asynchronous_client_asks_the_same(served: Served) -> None:
-    async def asked() -> tuple[dict[str, Any], dict[str, Any]]:
-        transport = httpx.ASGITransport(served.server.app)
+def test_the_asynchronous_client_asks_the_same(fits: ResidualFits) -> None:
+    async def ask_asynchronously() -> tuple[dict[str, Any], dict[str, Any]]:
+        transport = httpx.ASGITransport(fits.server.app)
         async with AsyncClient("http://testserver", transport=transport) as client:
-            return await client.residuals(served.runs[0]), await client.compare(*served.runs)
+            return await client.residuals(fits.runs[0]), await client.compare(*fits.runs)
 
-    residuals, compared = awaited(asked)
-    assert residuals["id"] == served.runs[0]
+    residuals, compared = await_in_thread(ask_asynchronously)
+    assert residuals["id"] == fits.runs[0]
     assert len(compared["runs"]) == 2
 
 
-def test_the_page_of_a_sweep_over_models_leads_to_their_comparison(served: Served) -> None:
-    page = served.server.get(f"/runs/{served.runs[0]}").text
+def test_the_page_of_a_sweep_over_models_leads_to_their_comparison(fits: ResidualFits) -> None:
+    page = fits.server.get(f"/runs/{fits.runs[0]}").text
     link = re.search(r'href="(/compare[^"]+)"', page)
     assert link is not None
-    compared = served.server.get(html.unescape(link[1]))
+    compared = fits.server.get(html.unescape(link[1]))
     assert compared.status_code == 200
     assert "L depends on the model" in compared.text
-    alone = served.server.get(f"/runs/{served.other}").text
+    alone = fits.server.get(f"/runs/{fits.other}").text
     assert "/compare" not in alone
 
 
-def test_figures_of_residuals_have_a_function_for_each_test(served: Served) -> None:
-    figure = served.server.get(f"/v1/runs/{served.runs[0]}/figures/residuals").json()
+def test_figures_of_residuals_have_a_function_for_each_test(fits: ResidualFits) -> None:
+    figure = fits.server.get(f"/v1/runs/{fits.runs[0]}/figures/residuals").json()
     assert sum(one["type"] == "bar" for one in figure["data"]) == 2
-    beyond = served.server.get(f"/v1/runs/{served.runs[0]}/figures/residuals?experiment=1")
-    refused(beyond, 404, "not-found")
+    beyond = fits.server.get(f"/v1/runs/{fits.runs[0]}/figures/residuals?experiment=1")
+    read_faults(beyond, 404, "not-found")
 
 
-def test_the_report_holds_tests_and_figures(served: Served) -> None:
-    job = served.server.get(f"/v1/runs/{served.runs[0]}").json()["job"]
-    text = served.server.get(f"/v1/jobs/{job}/report").text
+def test_the_report_holds_tests_and_figures(fits: ResidualFits) -> None:
+    job = fits.server.get(f"/v1/runs/{fits.runs[0]}").json()["job"]
+    text = fits.server.get(f"/v1/jobs/{job}/report").text
     assert "Correlation of the residuals: validation 1" in text
     assert "Onset delay, y behind u" in text
     assert "A dead time should not be longer." in text
@@ -323,7 +326,7 @@ def test_the_report_holds_tests_and_figures(served: Served) -> None:
     ],
 )
 def test_what_is_computed_again_is_what_was_stored_whatever_the_job(
-    served: Served, changes: dict[str, Any]
+    fits: ResidualFits, changes: dict[str, Any]
 ) -> None:
     body = {
         "model": "fopdt",
@@ -333,9 +336,9 @@ def test_what_is_computed_again_is_what_was_stored_whatever_the_job(
         "parameters": BOUNDS,
         "validation": {"fraction": 0.3},
     }
-    _, runs = identified(served.parts, {**body, **changes})
-    stored = result(served, runs[0])["residual_tests"]
-    asked = served.server.get(f"/v1/runs/{runs[0]}/residuals").json()
+    _, runs = identify_job(fits.parts, {**body, **changes})
+    stored = read_result(fits, runs[0])["residual_tests"]
+    asked = fits.server.get(f"/v1/runs/{runs[0]}/residuals").json()
     assert asked["data"] == stored["data"]
     assert len(asked["tests"]) == len(stored["tests"]) >= 2
     for one, kept in zip(asked["tests"], stored["tests"], strict=True):
@@ -350,14 +353,14 @@ def input_shapes(figure: dict[str, Any]) -> set[str]:
     return {one["line"].get("shape", "linear") for one in inputs}
 
 
-def test_figures_draw_an_input_as_the_job_holds_it(served: Served) -> None:
-    figure = served.server.get(f"/v1/runs/{served.runs[0]}/figures/response").json()
+def test_figures_draw_an_input_as_the_job_holds_it(fits: ResidualFits) -> None:
+    figure = fits.server.get(f"/v1/runs/{fits.runs[0]}/figures/response").json()
     assert input_shapes(figure) == {"hv"}
 
 
-def test_a_report_draws_an_input_as_the_job_holds_it(served: Served) -> None:
-    job = served.server.get(f"/v1/runs/{served.other}").json()["job"]
-    page = served.server.get(f"/v1/jobs/{job}/report").text
+def test_a_report_draws_an_input_as_the_job_holds_it(fits: ResidualFits) -> None:
+    job = fits.server.get(f"/v1/runs/{fits.other}").json()["job"]
+    page = fits.server.get(f"/v1/jobs/{job}/report").text
     texts = re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', page, re.DOTALL)
     figures = [json.loads(html.unescape(one)) for one in texts]
     shapes = [input_shapes(one) for one in figures if isinstance(one, dict) and "data" in one]

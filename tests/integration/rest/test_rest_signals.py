@@ -16,16 +16,16 @@ from service.formats.mcap import read_fitted_outputs, read_mcap
 from service.repositories.runs import RunRepository
 from service.storage.errors import ObjectStoreFailed
 from service.storage.tables import Run
-from tests.identified import identified
-from tests.mcap_files import read_run_record
-from tests.rest import parts_of, recording, store_csv
+from tests.support.files.mcap_files import read_run_record
+from tests.support.service.local_runs import identify_job
+from tests.support.service.web_app import parts_of, recording, store_csv
 from workers import job_queue, packing, tasks
 
 SMALL = {"population": 8, "generations": 5, "islands": 1}
 SIGMAS = [0.0, 0.1, 0.2]
 
 
-class Served(NamedTuple):
+class SignalRuns(NamedTuple):
     server: TestClient
     parts: Parts
     runs: list[str]
@@ -33,7 +33,7 @@ class Served(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def served(server: TestClient) -> Iterator[Served]:
+def signals(server: TestClient) -> Iterator[SignalRuns]:
     body = {
         "model": "fopdt",
         "datasets": [store_csv(server, recording())],
@@ -50,53 +50,53 @@ def served(server: TestClient) -> Iterator[Served]:
             (tasks, "PACK_LIMIT_SECONDS"),
         ):
             patched.setattr(module, name, 600.0)
-        _, runs = identified(parts_of(server), body)
-        yield Served(server, parts_of(server), runs, body)
+        _, runs = identify_job(parts_of(server), body)
+        yield SignalRuns(server, parts_of(server), runs, body)
 
 
-def rows(served: Served, runs: list[str]) -> list[Run]:
-    with served.parts.database.read_session() as session:
+def list_rows(signals: SignalRuns, runs: list[str]) -> list[Run]:
+    with signals.parts.database.read_session() as session:
         return [RunRepository(session).get(run) for run in runs]
 
 
-def test_each_run_has_a_file_of_its_own_in_the_object_of_its_pack(served: Served) -> None:
-    found = [served.server.get(f"/v1/runs/{run}/signals.mcap") for run in served.runs]
-    assert len({row.signals_sha256 for row in rows(served, served.runs)}) == 1
+def test_each_run_has_a_file_of_its_own_in_the_object_of_its_pack(signals: SignalRuns) -> None:
+    found = [signals.server.get(f"/v1/runs/{run}/signals.mcap") for run in signals.runs]
+    assert len({row.signals_sha256 for row in list_rows(signals, signals.runs)}) == 1
     assert len({one.headers["etag"] for one in found}) == len(found)
     assert len({read_fitted_outputs(one.content)[0].measured.tobytes() for one in found}) == len(
         SIGMAS
     )
-    for answer, run in zip(found, served.runs, strict=True):
+    for answer, run in zip(found, signals.runs, strict=True):
         (fit,) = read_fitted_outputs(answer.content)
-        shown = served.server.get(f"/v1/runs/{run}/response?max_points=10000").json()
+        shown = signals.server.get(f"/v1/runs/{run}/response?max_points=10000").json()
         (experiment,) = shown["experiments"]
         assert experiment["simulated"][0]["values"] == fit.simulated.tolist()
         assert experiment["measured"][0]["values"] == fit.measured.tolist()
-        told = served.server.get(f"/v1/runs/{run}").json()["rms"]
+        told = signals.server.get(f"/v1/runs/{run}").json()["rms"]
         assert np.sqrt(np.mean((fit.measured - fit.simulated) ** 2)) == pytest.approx(told)
 
 
-def test_ranges_are_of_the_runs_own_file(served: Served) -> None:
-    path = f"/v1/runs/{served.runs[1]}/signals.mcap"
-    whole = served.server.get(path)
-    head = served.server.head(path)
+def test_ranges_are_of_the_runs_own_file(signals: SignalRuns) -> None:
+    path = f"/v1/runs/{signals.runs[1]}/signals.mcap"
+    whole = signals.server.get(path)
+    head = signals.server.head(path)
     assert int(head.headers["content-length"]) == len(whole.content)
-    part = served.server.get(path, headers={"Range": "bytes=5-20"})
+    part = signals.server.get(path, headers={"Range": "bytes=5-20"})
     assert (part.status_code, part.content) == (206, whole.content[5:21])
     assert part.headers["content-range"] == f"bytes 5-20/{len(whole.content)}"
-    last = served.server.get(path, headers={"Range": "bytes=-8"})
+    last = signals.server.get(path, headers={"Range": "bytes=-8"})
     assert last.content == whole.content[-8:] == whole.content[:8]  # the magic of a whole file
-    beyond = served.server.get(path, headers={"Range": f"bytes={len(whole.content)}-"})
+    beyond = signals.server.get(path, headers={"Range": f"bytes={len(whole.content)}-"})
     assert beyond.status_code == 416
     etag = whole.headers["etag"]
-    assert served.server.get(path, headers={"If-None-Match": etag}).status_code == 304
+    assert signals.server.get(path, headers={"If-None-Match": etag}).status_code == 304
 
 
-def test_a_run_that_is_taken_over_shows_the_same_signals(served: Served) -> None:
-    _, again = identified(served.parts, {**served.body, "reuse": True})
-    for old, new in zip(served.runs, again, strict=True):
+def test_a_run_that_is_taken_over_shows_the_same_signals(signals: SignalRuns) -> None:
+    _, again = identify_job(signals.parts, {**signals.body, "reuse": True})
+    for old, new in zip(signals.runs, again, strict=True):
         first, second = (
-            served.server.get(f"/v1/runs/{run}/signals.mcap").content for run in (old, new)
+            signals.server.get(f"/v1/runs/{run}/signals.mcap").content for run in (old, new)
         )
         fits = [read_fitted_outputs(content) for content in (first, second)]
         assert fits[0][0].simulated.tobytes() == fits[1][0].simulated.tobytes()
@@ -104,10 +104,10 @@ def test_a_run_that_is_taken_over_shows_the_same_signals(served: Served) -> None
         assert (about["run"], about["reused_from"]) == (new, old)  # a file of its own
 
 
-def test_the_file_of_a_run_says_what_it_was_made_from(served: Served) -> None:
-    run = served.runs[1]
-    told = served.server.get(f"/v1/runs/{run}").json()
-    content = served.server.get(f"/v1/runs/{run}/signals.mcap").content
+def test_the_file_of_a_run_says_what_it_was_made_from(signals: SignalRuns) -> None:
+    run = signals.runs[1]
+    told = signals.server.get(f"/v1/runs/{run}").json()
+    content = signals.server.get(f"/v1/runs/{run}/signals.mcap").content
     about = read_run_record(content)
     assert (about["run"], about["job"]) == (run, told["job"])
     for name in ("version", "fingerprint", "spec_hash"):
@@ -118,56 +118,56 @@ def test_the_file_of_a_run_says_what_it_was_made_from(served: Served) -> None:
     estimates = {one["name"]: one["value"] for one in told["parameters"]}
     assert {one["name"]: one["value"] for one in json.loads(about["parameters"])} == estimates
     (dataset,) = json.loads(about["datasets"])
-    assert dataset["id"] == served.body["datasets"][0]
-    stored = served.server.get(f"/v1/datasets/{dataset['id']}").json()
+    assert dataset["id"] == signals.body["datasets"][0]
+    stored = signals.server.get(f"/v1/datasets/{dataset['id']}").json()
     assert dataset["sha256"] == stored["sha256"]
     summary = make_reader(BytesIO(content)).get_summary()
     assert summary is not None
     assert {channel.topic for channel in summary.channels.values()} == {"/fit", "/inputs"}
     recording = read_mcap(content)
-    whole = read_mcap(served.server.get(f"/v1/datasets/{dataset['id']}/content").content)
+    whole = read_mcap(signals.server.get(f"/v1/datasets/{dataset['id']}/content").content)
     np.testing.assert_array_equal(
         recording.channel("estimation 1/u/input").values, whole.channel("u").values
     )
 
 
 def test_a_job_and_an_export_name_the_program_that_identified(
-    served: Served, monkeypatch: pytest.MonkeyPatch
+    signals: SignalRuns, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job = served.server.get(f"/v1/runs/{served.runs[0]}").json()["job"]
-    told = served.server.get(f"/v1/jobs/{job}").json()
-    run = served.server.get(f"/v1/runs/{served.runs[0]}").json()
+    job = signals.server.get(f"/v1/runs/{signals.runs[0]}").json()["job"]
+    told = signals.server.get(f"/v1/jobs/{job}").json()
+    run = signals.server.get(f"/v1/runs/{signals.runs[0]}").json()
     assert (told["version"], told["fingerprint"]) == (run["version"], run["fingerprint"])
     assert len(told["spec_hash"]) == 64
-    with served.parts.database.write_session() as session:
-        row = session.get_one(Run, served.runs[0])
+    with signals.parts.database.write_session() as session:
+        row = session.get_one(Run, signals.runs[0])
         row.result = {**(row.result or {}), "version": "0.0.7"}
-    exported = served.server.get(f"/v1/runs/{served.runs[0]}/export?format=python").text
+    exported = signals.server.get(f"/v1/runs/{signals.runs[0]}/export?format=python").text
     assert "Identified by lagid 0.0.7." in exported
-    document = served.server.get(f"/v1/runs/{served.runs[0]}/export").json()
+    document = signals.server.get(f"/v1/runs/{signals.runs[0]}/export").json()
     assert document["lagid"] == "0.0.7"
 
 
 def test_signals_that_cannot_be_stored_cost_no_result_and_are_told_once(
-    served: Served, monkeypatch: pytest.MonkeyPatch
+    signals: SignalRuns, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(_blocks: object) -> None:
         raise ObjectStoreFailed("the disk is full")
 
     with monkeypatch.context() as patched:
-        patched.setattr(served.parts.store, "put_stream", full)
+        patched.setattr(signals.parts.store, "put_stream", full)
         patched.setattr(fitted_signals, "RETRY_SECONDS", 0.1)
-        job, runs = identified(served.parts, served.body)
-    found = rows(served, runs)
+        job, runs = identify_job(signals.parts, signals.body)
+    found = list_rows(signals, runs)
     assert [(row.state.value, row.signals_sha256) for row in found] == [("succeeded", None)] * 3
-    again = served.server.get(f"/v1/runs/{runs[0]}/signals.mcap")
+    again = signals.server.get(f"/v1/runs/{runs[0]}/signals.mcap")
     assert (again.status_code, again.headers["etag"][0]) == (200, '"')
-    stored = served.server.get(f"/v1/runs/{served.runs[0]}/signals.mcap")
+    stored = signals.server.get(f"/v1/runs/{signals.runs[0]}/signals.mcap")
     assert [fit.simulated.tobytes() for fit in read_fitted_outputs(again.content)] == [
         fit.simulated.tobytes() for fit in read_fitted_outputs(stored.content)
     ]
-    part = served.server.get(f"/v1/runs/{runs[0]}/signals.mcap", headers={"Range": "bytes=5-20"})
+    part = signals.server.get(f"/v1/runs/{runs[0]}/signals.mcap", headers={"Range": "bytes=5-20"})
     assert (part.status_code, part.content) == (206, again.content[5:21])
-    events = served.server.get(f"/v1/jobs/{job}/events").text
+    events = signals.server.get(f"/v1/jobs/{job}/events").text
     assert events.count("are not stored") == 1
     assert f"{runs[0]} and 2 others" in events

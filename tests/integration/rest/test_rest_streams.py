@@ -15,15 +15,22 @@ from service.api.app import create_app
 from service.api.dependencies import Parts
 from service.api.event_feed import EventFeed
 from service.repositories.events import JobHead
-from tests.limits import LIMIT_SECONDS
-from tests.rest import awaited, parts_of, recording, refused, settings_of, store_csv
-from tests.serving import serve_in_thread
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.service.web_app import (
+    await_in_thread,
+    parts_of,
+    read_faults,
+    recording,
+    settings_of,
+    store_csv,
+)
+from tests.support.service.web_server import serve_in_thread
 
 STREAMS = 30
 
 
 @pytest.fixture
-def served(tmp_path: Path) -> Iterator[tuple[httpx.Client, str, Parts]]:
+def stream_server(tmp_path: Path) -> Iterator[tuple[httpx.Client, str, Parts]]:
     """A service on a port with room for 30 streams, and a queued job."""
     app = create_app(settings_of(tmp_path, max_streams=STREAMS, poll_seconds=0.05))
     with serve_in_thread(app) as url, httpx.Client(base_url=url, timeout=LIMIT_SECONDS) as client:
@@ -56,9 +63,9 @@ async def open_streams(
 
 
 def test_streams_that_are_opened_at_once_do_not_pass_the_limit_together(
-    served: tuple[httpx.Client, str, Parts],
+    stream_server: tuple[httpx.Client, str, Parts],
 ) -> None:
-    plain, job, _ = served
+    plain, job, _ = stream_server
 
     async def play() -> list[int]:
         limits = httpx.Limits(max_connections=2 * STREAMS)
@@ -75,13 +82,13 @@ def test_streams_that_are_opened_at_once_do_not_pass_the_limit_together(
             await asyncio.gather(*tasks)
             return statuses
 
-    assert sorted(awaited(play)) == [200] * STREAMS + [503] * STREAMS
+    assert sorted(await_in_thread(play)) == [200] * STREAMS + [503] * STREAMS
 
 
 def test_streams_share_their_readings_and_one_beyond_the_limit_is_refused(
-    served: tuple[httpx.Client, str, Parts],
+    stream_server: tuple[httpx.Client, str, Parts],
 ) -> None:
-    plain, job, parts = served
+    plain, job, parts = stream_server
     path, statements, looks = f"/v1/jobs/{job}/events", [], []
     read_heads = parts.feed._read_heads
 
@@ -105,7 +112,7 @@ def test_streams_share_their_readings_and_one_beyond_the_limit_is_refused(
                 async with client.stream("GET", path) as answer:
                     assert answer.status_code == 503
                     await answer.aread()
-                refused(answer, 503, "unavailable")
+                read_faults(answer, 503, "unavailable")
                 assert int(answer.headers["retry-after"]) > 0
                 statements.clear()
                 looks.clear()
@@ -120,7 +127,7 @@ def test_streams_share_their_readings_and_one_beyond_the_limit_is_refused(
     event.listen(
         parts.database.engine, "before_cursor_execute", lambda *call: statements.append(call[2])
     )
-    texts = awaited(play)
+    texts = await_in_thread(play)
     assert len(set(texts)) == 1
     assert texts[0].count("event: end") == 1
     assert plain.get(path).text == texts[0]  # the places of the streams are free again
@@ -158,7 +165,7 @@ def test_readings_of_one_event_are_shared_and_a_reader_that_leaves_stops_nobody(
             assert await feed.wait_for_news(job, 0, 60)
             assert not await feed.wait_for_news(job, batches[0].last, 0.1)
 
-    awaited(play)
+    await_in_thread(play)
 
 
 def test_many_streams_are_woken_in_turns_and_those_of_other_jobs_not_at_all(
@@ -192,4 +199,4 @@ def test_many_streams_are_woken_in_turns_and_those_of_other_jobs_not_at_all(
             await run_others()
         assert not feed._waiting
 
-    awaited(play)
+    await_in_thread(play)

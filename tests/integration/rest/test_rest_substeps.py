@@ -10,8 +10,8 @@ from service.formats.mcap import read_fitted_outputs
 from sysid.data.records import Channel
 from sysid.models.parse import parse_model
 from sysid.simulation.simulate import simulate
-from tests.identified import identified
-from tests.rest import parts_of, store_csv
+from tests.support.service.local_runs import identify_job
+from tests.support.service.web_app import parts_of, store_csv
 
 N = 200
 TWO_LAGS: dict[str, Any] = {
@@ -30,7 +30,7 @@ TWO_LAGS: dict[str, Any] = {
 }
 
 
-class Served(NamedTuple):
+class FineRun(NamedTuple):
     """An application with a run, its dataset, its result and the input as a signal."""
 
     server: TestClient
@@ -41,7 +41,7 @@ class Served(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def served(server: TestClient) -> Served:
+def fine_run(server: TestClient) -> FineRun:
     random = np.random.default_rng(1)
     times = np.arange(N, dtype=np.float64)
     inlet = Channel("u", times, np.repeat(random.standard_normal(N // 5), 5).round(3), hold="zero")
@@ -56,55 +56,57 @@ def served(server: TestClient) -> Served:
         "hold": {"u": "zero"},
         "algorithm": {"population": 16, "generations": 40},
     }
-    _, (run,) = identified(parts_of(server), body)
+    _, (run,) = identify_job(parts_of(server), body)
     found = server.get(f"/v1/runs/{run}").json()
     series = {"kind": "series", "times": times.tolist(), "values": inlet.values.tolist()}
-    return Served(server, run, dataset, found, {**series, "hold": "zero"})
+    return FineRun(server, run, dataset, found, {**series, "hold": "zero"})
 
 
-def test_the_result_has_its_substeps(served: Served) -> None:
-    assert served.found["substeps"] > 1
-    [note] = [text for text in served.found["warnings"] if "substeps: 1" in text]
-    assert f"substeps: {served.found['substeps']}:" in note
+def test_the_result_has_its_substeps(fine_run: FineRun) -> None:
+    assert fine_run.found["substeps"] > 1
+    [note] = [text for text in fine_run.found["warnings"] if "substeps: 1" in text]
+    assert f"substeps: {fine_run.found['substeps']}:" in note
 
 
-def fitted(served: Served) -> Any:
-    answer = served.server.get(f"/v1/runs/{served.run}/signals.mcap")
+def wait_for_fit(fine_run: FineRun) -> Any:
+    answer = fine_run.server.get(f"/v1/runs/{fine_run.run}/signals.mcap")
     [fit] = read_fitted_outputs(answer.content)
     return fit
 
 
-def test_a_simulation_is_that_of_the_fitted_signals(served: Served) -> None:
+def test_a_simulation_is_that_of_the_fitted_signals(fine_run: FineRun) -> None:
     body = {
         "samples": N,
         "sample_time": 1.0,
-        "inputs": {"u": served.inlet},
+        "inputs": {"u": fine_run.inlet},
     }
-    answer = served.server.post(f"/v1/runs/{served.run}:simulate", json=body)
+    answer = fine_run.server.post(f"/v1/runs/{fine_run.run}:simulate", json=body)
     assert answer.status_code == 200, answer.text
     [y] = answer.json()["outputs"]
-    np.testing.assert_allclose(y["values"], fitted(served).simulated, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(y["values"], wait_for_fit(fine_run).simulated, rtol=1e-9, atol=1e-9)
 
 
-def test_a_free_run_on_its_own_data_has_the_error_of_the_result(served: Served) -> None:
-    answer = served.server.post(f"/v1/runs/{served.run}:validate", json={"dataset": served.dataset})
+def test_a_free_run_on_its_own_data_has_the_error_of_the_result(fine_run: FineRun) -> None:
+    answer = fine_run.server.post(
+        f"/v1/runs/{fine_run.run}:validate", json={"dataset": fine_run.dataset}
+    )
     assert answer.status_code == 200, answer.text
-    assert answer.json()["rms"] == pytest.approx(served.found["rms"])
+    assert answer.json()["rms"] == pytest.approx(fine_run.found["rms"])
 
 
 @pytest.mark.parametrize("name", ["K", "r"])
-def test_a_profile_is_lowest_at_the_estimate(served: Served, name: str) -> None:
+def test_a_profile_is_lowest_at_the_estimate(fine_run: FineRun, name: str) -> None:
     body = {"parameters": [name], "points": 5}
-    answer = served.server.post(f"/v1/runs/{served.run}:profile", json=body)
+    answer = fine_run.server.post(f"/v1/runs/{fine_run.run}:profile", json=body)
     assert answer.status_code == 200, answer.text
     [profile] = answer.json()["profiles"]
-    assert min(profile["rms"]) == pytest.approx(served.found["rms"])
+    assert min(profile["rms"]) == pytest.approx(fine_run.found["rms"])
 
 
-def test_exports_have_the_substeps(served: Served) -> None:
-    substeps = served.found["substeps"]
-    path = f"/v1/runs/{served.run}/export"
-    document = served.server.get(path, params={"format": "json"}).json()
+def test_exports_have_the_substeps(fine_run: FineRun) -> None:
+    substeps = fine_run.found["substeps"]
+    path = f"/v1/runs/{fine_run.run}/export"
+    document = fine_run.server.get(path, params={"format": "json"}).json()
     assert parse_model(document["model"]).solver.substeps == substeps
     for form, text in (("python", f"/{substeps}"), ("c", f"/{substeps}.0")):
-        assert f"{text}" in served.server.get(path, params={"format": form}).text
+        assert f"{text}" in fine_run.server.get(path, params={"format": form}).text

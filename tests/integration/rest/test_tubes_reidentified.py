@@ -6,9 +6,9 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
-from tests.identified import carried_out
-from tests.needs import DATA
-from tests.rest import CSV, settings_of
+from tests.support.requirements import DATA
+from tests.support.service.local_runs import carry_out_job
+from tests.support.service.web_app import CSV, settings_of
 
 # T and L in s by another program's least squares, printed to 0.1 ms.
 KNOWN = {5: (0.0153, 0.0181), 20: (0.1287, 0.0494), 40: (0.3492, 0.1127)}
@@ -33,7 +33,7 @@ def test_a_warm_batch_finds_the_known_time_constants_and_lags(tmp_path: Path) ->
             "channels": {"u": "P1_meas_Pa", "y": "P2_meas_Pa"},
         }
         job = server.post("/v1/recipes/reidentify", json=body).json()["id"]
-        carried_out(app.state.parts, job)
+        carry_out_job(app.state.parts, job)
         trend = server.get(f"/v1/jobs/{job}/trend").json()
     found = {one["name"]: one for one in trend["quantities"]}
     for number, (constant, lag) in enumerate(KNOWN.values()):

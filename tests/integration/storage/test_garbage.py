@@ -20,8 +20,8 @@ from service.storage.garbage import (
     find_orphans,
 )
 from service.storage.objects import open_store
-from tests.stored import claimed, new_dataset
-from tests.stores import make_bucket
+from tests.support.storage.job_rows import new_dataset, submit_and_claim
+from tests.support.storage.object_stores import make_bucket
 
 AT_ONCE = timedelta(seconds=-5)
 
@@ -39,7 +39,7 @@ def garbage(database, store, older_than=AT_ONCE):
 
 def test_only_objects_that_no_living_row_names_are_garbage(database, store):
     raw, fit, stray = (store.put_stream([name]).sha256 for name in (b"raw", b"fit", b"stray"))
-    got, (run_id,) = claimed(database)
+    got, (run_id,) = submit_and_claim(database)
     with database.write_session() as session:
         datasets = DatasetRepository(session)
         dataset_id = datasets.add(new_dataset(sha256=raw)).dataset.id
@@ -80,7 +80,7 @@ def test_an_object_that_a_row_names_but_is_not_there_is_lost(database, store):
 
 def test_the_signals_of_runs_are_lost_too_unless_their_job_was_deleted(database, store):
     kept = store.put_stream([b"kept"]).sha256
-    got, runs = claimed(database, n_runs=4)
+    got, runs = submit_and_claim(database, n_runs=4)
     hashes = ("f" * 64, kept, "0" * 64, "f" * 64)
     outcomes = [
         RunOutcome(run_id=run, state=JobState.SUCCEEDED, signals_sha256=sha256)

@@ -12,40 +12,40 @@ from service.storage import migrate, sessions
 from service.storage.errors import DatabaseNotAtHead, DatabaseUnknown, UnknownRevision
 from service.storage.sessions import Database
 from service.storage.tables import Base, Project
-from tests.database import empty_postgres
-from tests.limits import LIMIT_SECONDS
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.storage.databases import empty_postgres
 
 HEAD = migrate.find_head_revision()
 
 
 @pytest.fixture
-def migrated(empty_database):
+def migrated_database(empty_database):
     """A database of the test's own with the tables of today, of both kinds."""
     migrate.upgrade_database(empty_database)
     return empty_database
 
 
-def tables(database):
+def list_tables(database):
     return set(inspect(database.engine).get_table_names()) - {"alembic_version"}
 
 
 def test_the_migrations_build_exactly_the_tables_of_the_program(empty_database):
     migrate.upgrade_database(empty_database)
-    assert tables(empty_database) == set(Base.metadata.tables)
+    assert list_tables(empty_database) == set(Base.metadata.tables)
     assert migrate.list_differences(empty_database) == []
 
 
 def test_indexes_are_those_of_the_program_with_their_conditions(empty_database):
     migrate.upgrade_database(empty_database)
-    migrated = indexes(empty_database)
+    migrated = list_indexes(empty_database)
     migrate.downgrade_database(empty_database)
     Base.metadata.create_all(empty_database.engine)
-    assert migrated == indexes(empty_database)
+    assert migrated == list_indexes(empty_database)
     assert any("WHERE" in definition for definition in migrated.values())
     Base.metadata.drop_all(empty_database.engine)
 
 
-def indexes(database):
+def list_indexes(database):
     """The definition of each index that has a name of ours."""
     query = "SELECT name, sql FROM sqlite_master WHERE type = 'index' AND sql IS NOT NULL"
     if not database.is_sqlite:
@@ -88,7 +88,7 @@ def test_a_column_is_empty_or_has_a_default_only_if_the_program_says_so(empty_da
 def test_going_down_removes_every_table_and_up_again_brings_them_back(empty_database):
     migrate.upgrade_database(empty_database)
     migrate.downgrade_database(empty_database)
-    assert tables(empty_database) == set()
+    assert list_tables(empty_database) == set()
     assert migrate.read_current_revision(empty_database) is None
     migrate.upgrade_database(empty_database)
     assert migrate.list_differences(empty_database) == []
@@ -108,8 +108,8 @@ def test_a_database_that_is_not_at_the_head_is_told(empty_database):
 
 
 @pytest.mark.parametrize("revision", ["v9999", "0001", "0009"])  # no release has the last two
-def test_a_database_of_an_unknown_revision_is_not_touched(migrated, revision):
-    with migrated.engine.begin() as connection:
+def test_a_database_of_an_unknown_revision_is_not_touched(migrated_database, revision):
+    with migrated_database.engine.begin() as connection:
         connection.execute(text(f"UPDATE alembic_version SET version_num = '{revision}'"))
     actions = (
         migrate.upgrade_database,
@@ -120,8 +120,8 @@ def test_a_database_of_an_unknown_revision_is_not_touched(migrated, revision):
     told = rf"{revision}.*up to {HEAD}.*`lagid db downgrade {HEAD}`.*before 0\.1\.0.*new folder"
     for action in actions:
         with pytest.raises(DatabaseUnknown, match=told):
-            action(migrated)
-    assert migrate.read_current_revision(migrated) == revision
+            action(migrated_database)
+    assert migrate.read_current_revision(migrated_database) == revision
 
 
 def test_upgrading_again_changes_nothing(database):
@@ -142,7 +142,7 @@ def test_a_migration_that_fails_leaves_the_database_as_it_was(empty_database):
         connection.execute(text("CREATE TABLE dispatchers (x INTEGER)"))  # the last one made
     with pytest.raises(Exception, match="already exists"):
         migrate.upgrade_database(empty_database)
-    assert tables(empty_database) == {"dispatchers"}
+    assert list_tables(empty_database) == {"dispatchers"}
 
 
 def test_threads_that_upgrade_at_once_do_not_race(empty_database):
@@ -196,51 +196,53 @@ def copies(database):
         return list(connection.scalars(text("SELECT copy FROM projects")))
 
 
-def columns(database):
+def list_columns(database):
     return {one["name"] for one in inspect(database.engine).get_columns("projects")}
 
 
-def test_a_further_revision_carries_the_rows_over_and_back(migrated, add_revision):
-    before, known = columns(migrated), migrate.list_revisions()
+def test_a_further_revision_carries_the_rows_over_and_back(migrated_database, add_revision):
+    before, known = list_columns(migrated_database), migrate.list_revisions()
     add_revision()
     with pytest.raises(DatabaseNotAtHead, match="next"):
-        migrate.check_revision(migrated)
-    migrate.upgrade_database(migrated)
-    assert copies(migrated) == ["default"]
-    undone = migrate.list_undone_migrations(migrated, "base")
+        migrate.check_revision(migrated_database)
+    migrate.upgrade_database(migrated_database)
+    assert copies(migrated_database) == ["default"]
+    undone = migrate.list_undone_migrations(migrated_database, "base")
     assert [name for name, _ in undone] == ["next", *known]
-    assert [name for name, _ in migrate.list_undone_migrations(migrated, HEAD)] == ["next"]
+    assert [name for name, _ in migrate.list_undone_migrations(migrated_database, HEAD)] == ["next"]
     earlier = ", ".join((*known, "base"))
     with pytest.raises(UnknownRevision, match=f"Earlier ones, the latest first: {earlier}"):
-        migrate.list_undone_migrations(migrated, "next")
-    migrate.downgrade_database(migrated, HEAD)
-    assert columns(migrated) == before
-    with migrated.read_session() as session:
+        migrate.list_undone_migrations(migrated_database, "next")
+    migrate.downgrade_database(migrated_database, HEAD)
+    assert list_columns(migrated_database) == before
+    with migrated_database.read_session() as session:
         assert [one.name for one in session.query(Project)] == ["default"]
-    assert migrate.list_differences(migrated) == []
+    assert migrate.list_differences(migrated_database) == []
 
 
-def test_a_further_revision_that_fails_leaves_the_database_as_it_was(migrated, add_revision):
-    before = columns(migrated)
+def test_a_further_revision_that_fails_leaves_the_database_as_it_was(
+    migrated_database, add_revision
+):
+    before = list_columns(migrated_database)
     add_revision(last='raise OSError("in the middle")')
     with pytest.raises(OSError, match="in the middle"):
-        migrate.upgrade_database(migrated)
-    assert columns(migrated) == before
-    assert migrate.read_current_revision(migrated) == HEAD
+        migrate.upgrade_database(migrated_database)
+    assert list_columns(migrated_database) == before
+    assert migrate.read_current_revision(migrated_database) == HEAD
 
 
 def test_an_upgrade_waits_for_a_writer_that_has_begun_and_carries_over_what_it_wrote(
-    migrated, add_revision
+    migrated_database, add_revision
 ):
     add_revision()
     with ThreadPoolExecutor(1) as pool:
-        with migrated.engine.begin() as writer:
+        with migrated_database.engine.begin() as writer:
             writer.execute(text("UPDATE projects SET name = 'early'"))
-            upgraded = pool.submit(migrate.upgrade_database, migrated)
-            wait_for_a_lock(migrated, upgraded)
+            upgraded = pool.submit(migrate.upgrade_database, migrated_database)
+            wait_for_a_lock(migrated_database, upgraded)
             writer.execute(text("UPDATE projects SET name = 'late'"))
         upgraded.result()
-    assert copies(migrated) == ["late"]
+    assert copies(migrated_database) == ["late"]
 
 
 def wait_for_a_lock(database, upgraded):
@@ -254,14 +256,14 @@ def wait_for_a_lock(database, upgraded):
 
 
 def test_an_upgrade_waits_longer_for_its_turn_than_other_writers(
-    migrated, add_revision, monkeypatch
+    migrated_database, add_revision, monkeypatch
 ):
     monkeypatch.setattr(sessions, "BUSY_SECONDS", 0.01)
     add_revision()
     with ThreadPoolExecutor(1) as pool:
-        with migrated.engine.begin() as writer:
+        with migrated_database.engine.begin() as writer:
             writer.execute(text("UPDATE projects SET name = 'late'"))
-            upgraded = pool.submit(migrate.upgrade_database, migrated)
+            upgraded = pool.submit(migrate.upgrade_database, migrated_database)
             time.sleep(0.3)
         upgraded.result()
-    assert copies(migrated) == ["late"]
+    assert copies(migrated_database) == ["late"]

@@ -14,7 +14,7 @@ QUICK = GeneticAlgorithm(population=60, generations=40, islands=2)
 TRUTH = {"K": 2.0, "T": 0.6, "L": 0.3, "y0": 0.0, "x(0)": 0.0}
 
 
-def fitted(offset: float, y0: dict[str, float] | None = None) -> Identification:
+def identify_response(offset: float, y0: dict[str, float] | None = None) -> Identification:
     """A first-order response on top of an offset that given bounds may not foresee."""
     times = 0.05 * np.arange(400.0)
     u = Channel("u", times, np.where((times // 3) % 2 < 1, 0.0, 1.0), hold="zero")
@@ -34,7 +34,7 @@ def fitted(offset: float, y0: dict[str, float] | None = None) -> Identification:
 
 @pytest.mark.parametrize("offset", [40.0, 101_325.0, -3e6])
 def test_an_offset_outside_its_bounds_is_at_bound_and_is_the_one_to_widen(offset: float) -> None:
-    found = fitted(offset)
+    found = identify_response(offset)
     y0 = next(one for one in found.parameters if one.name == "y0")
     assert y0.status == "at bound"
     side, cure, bound = ("upper", "raise", 10) if offset > 0 else ("lower", "lower", -10)
@@ -44,7 +44,7 @@ def test_an_offset_outside_its_bounds_is_at_bound_and_is_the_one_to_widen(offset
 
 
 def test_with_bounds_that_are_wide_enough_nothing_is_said_of_them() -> None:
-    found = fitted(40.0, {"lower": 0, "upper": 100})
+    found = identify_response(40.0, {"lower": 0, "upper": 100})
     assert not any("To widen" in one for one in found.warnings)
     values = {one.name: one.value for one in found.parameters}
     assert values["y0"] == pytest.approx(40.0, abs=0.05)

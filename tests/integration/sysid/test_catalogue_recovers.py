@@ -8,7 +8,7 @@ from sysid.identification.identify import identify
 from sysid.models.catalogue.load import catalogue, load_model
 from sysid.models.model import Model
 from sysid.results.identification import Identification
-from tests.catalogue_cases import CASES, Case, made
+from tests.support.library.catalogue_cases import CASES, Case, make_record
 
 
 def search(model: Model, record: Record, case: Case) -> Identification:
@@ -32,7 +32,7 @@ SIMILAR = {"silverbox-9", "narx", "actuator"}
 )
 def test_the_parameters_that_made_a_record_are_found_again(name: str) -> None:
     model, case = load_model(name), CASES[name]
-    found = search(model, made(model, case), case)
+    found = search(model, make_record(model, case), case)
     spans = {parameter.name: parameter.upper - parameter.lower for parameter in model.parameters}
     free = {p.name for p in model.parameters if p.is_free}
     statuses = {one.name: one.status for one in found.parameters if one.name in free}

@@ -18,12 +18,18 @@ from sysid.data.records import Hold
 from sysid.models.catalogue.load import catalogue, load_model
 from sysid.models.model import Model
 from sysid.models.parse import keep_terms, parse_model
-from tests.exporting import compiled, in_c, in_python, simulated, with_entry
+from tests.support.library.exported_programs import (
+    add_entry,
+    compile_library,
+    run_c,
+    run_python,
+    simulate_outputs,
+)
 
 N = 240
 
 
-class Case(NamedTuple):
+class ExportCase(NamedTuple):
     """A model with values; its inputs are steps of this amplitude, its period `h` is in s."""
 
     values: dict[str, float]
@@ -33,7 +39,7 @@ class Case(NamedTuple):
 
 NARX = {p.name: 0.02 for p in load_model("narx").parameters} | {"dh": 2.4, "dk": 1.7}
 CASES = {
-    "actuator": Case(
+    "actuator": ExportCase(
         {
             "J": 6e-4,
             "F_c": 0.01,
@@ -49,22 +55,22 @@ CASES = {
         0.01,
         3e4,
     ),
-    "coulomb-delay": Case({"c": 0.2, "L": 0.3337, "b": 5, "mu": 0.5}, 0.02, 10),
-    "coulomb-eq16": Case({"c": 0.2, "L": 0.3337, "b": 5, "mu": 0.5}, 0.02, 10),
-    "delayed-logistic": Case({"r": 1.2, "K": 2, "L": 1.237, "x(0)": 0.3}, 0.1),
-    "delayed-van-der-pol": Case(
+    "coulomb-delay": ExportCase({"c": 0.2, "L": 0.3337, "b": 5, "mu": 0.5}, 0.02, 10),
+    "coulomb-eq16": ExportCase({"c": 0.2, "L": 0.3337, "b": 5, "mu": 0.5}, 0.02, 10),
+    "delayed-logistic": ExportCase({"r": 1.2, "K": 2, "L": 1.237, "x(0)": 0.3}, 0.1),
+    "delayed-van-der-pol": ExportCase(
         {"mu": 0.7, "w": 2, "g": -0.5, "L": 0.4337, "x(0)": 0.3, "v(0)": -0.2}
     ),
-    "duffing-delay": Case({"c": 0.2, "L": 0.5137, "b": 5, "a": 1}, 0.02, 10),
-    "duffing-eq16": Case({"c": 0.2, "L": 0.5137, "b": 5, "a": 1}, 0.02, 10),
-    "emps": Case({"M": 95, "Fv": 200, "Fc": 20, "o": -3, "y(0)": 0.1}, 0.01),
-    "exponential": Case({"L": 0.8}, 0.02),
-    "fopdt": Case({"K": 2, "T": 0.8, "L": 0.4337, "y0": 0.3, "x(0)": 0.3}),
-    "foipdt": Case({"K": 0.8, "T": 0.5, "L": 0.2337, "w(0)": 0.4, "y(0)": 0.3}),
-    "ipdt": Case({"K": 0.8, "L": 0.2337, "y(0)": 0.3}),
-    "mackey-glass": Case({"beta": 0.2, "gamma": 0.1, "n": 10, "L": 17.3, "x(0)": 0.9}, 0.5),
-    "narx": Case({**NARX, "y(0)": 0.3}),
-    "silverbox": Case(
+    "duffing-delay": ExportCase({"c": 0.2, "L": 0.5137, "b": 5, "a": 1}, 0.02, 10),
+    "duffing-eq16": ExportCase({"c": 0.2, "L": 0.5137, "b": 5, "a": 1}, 0.02, 10),
+    "emps": ExportCase({"M": 95, "Fv": 200, "Fc": 20, "o": -3, "y(0)": 0.1}, 0.01),
+    "exponential": ExportCase({"L": 0.8}, 0.02),
+    "fopdt": ExportCase({"K": 2, "T": 0.8, "L": 0.4337, "y0": 0.3, "x(0)": 0.3}),
+    "foipdt": ExportCase({"K": 0.8, "T": 0.5, "L": 0.2337, "w(0)": 0.4, "y(0)": 0.3}),
+    "ipdt": ExportCase({"K": 0.8, "L": 0.2337, "y(0)": 0.3}),
+    "mackey-glass": ExportCase({"beta": 0.2, "gamma": 0.1, "n": 10, "L": 17.3, "x(0)": 0.9}, 0.5),
+    "narx": ExportCase({**NARX, "y(0)": 0.3}),
+    "silverbox": ExportCase(
         {
             "b": 1e5,
             "d": 50,
@@ -79,7 +85,7 @@ CASES = {
         0.001,
         0.1,
     ),
-    "silverbox-9": Case(
+    "silverbox-9": ExportCase(
         {
             "b": 1e5,
             "d": 50,
@@ -97,13 +103,15 @@ CASES = {
         0.001,
         0.1,
     ),
-    "sopdt": Case({"K": 2, "T1": 0.8, "r": 0.4, "L": 0.4337, "y0": 0.3, "x(0)": 0.3, "w(0)": 0}),
-    "topdt": Case(
+    "sopdt": ExportCase(
+        {"K": 2, "T1": 0.8, "r": 0.4, "L": 0.4337, "y0": 0.3, "x(0)": 0.3, "w(0)": 0}
+    ),
+    "topdt": ExportCase(
         {"K": 2, "T1": 0.8, "r2": 0.4, "r3": 0.9, "L": 0.4337, "y0": 0.3}
         | {"x(0)": 0.3, "w(0)": 0, "v(0)": 0.1}
     ),
-    "tube": Case({"K": 1, "T": 0.3, "L": 0.2137, "y(0)": 0.3}),
-    "tube-second-order": Case({"K": 1, "w": 5, "z": 0.5, "L": 0.4337, "y(0)": 0.3}),
+    "tube": ExportCase({"K": 1, "T": 0.3, "L": 0.2137, "y(0)": 0.3}),
+    "tube-second-order": ExportCase({"K": 1, "w": 5, "z": 0.5, "L": 0.4337, "y(0)": 0.3}),
 }
 
 # What the catalogue does not have: methods, grids, interpolation, names that a program needs
@@ -161,17 +169,17 @@ def starting(text: str, initial: Any, **solver: Any) -> Model:
     return parse_model({**yaml.safe_load(text), "initial": initial, "solver": solver})
 
 
-def selected() -> Model:
+def select_terms() -> Model:
     """A polynomial whose terms were selected."""
     labels = [term.label for term in parse_model(LINEAR_NARX).terms]
     return keep_terms(parse_model(LINEAR_NARX), [labels[0], labels[1], labels[-1]])
 
 
 COEFFICIENTS = dict(
-    zip([p.name for p in selected().parameters if p.name != "d"], (0.6, 0.2, 0.1), strict=True)
+    zip([p.name for p in select_terms().parameters if p.name != "d"], (0.6, 0.2, 0.1), strict=True)
 )
-_TWO = Case({"lambda": 0.1337, "n": 2.5, "np": 0.7, "int(0)": 0.2})
-_RECURSION = Case({"L": 0.0712, "d": 1.3})
+_TWO = ExportCase({"lambda": 0.1337, "n": 2.5, "np": 0.7, "int(0)": 0.2})
+_RECURSION = ExportCase({"L": 0.0712, "d": 1.3})
 RESTING = """
 name: resting
 form: differential
@@ -194,7 +202,7 @@ equations:
 outputs: {y: "x + mod(w, T) + erf(x)", z: "clip(w, x, 0.3)"}
 initial: {x: 0.2, w: erf(K)}
 """
-_FUNCTIONS = Case({"K": 1.5, "T": 0.2, "L": 0.0737})
+_FUNCTIONS = ExportCase({"K": 1.5, "T": 0.2, "L": 0.0737})
 # Intermediate names everywhere, also of other names and of the past.
 NAMES = """
 name: names
@@ -272,9 +280,9 @@ outputs: {ramp: x(t - L) + w(t - 3*L), between: "u(t - L)", dt: x, y: w}
 history: {x: K*exp(t/T) - 0.2, w: "where(t < -0.1, T, 3*sin(9*t)) + 0.3"}
 initial: {w: {lower: -1, upper: 1}}
 """
-_HISTORY = Case({"K": 0.5, "T": 0.2, "L": 0.0737, "w(0)": 0.4})
-_RESTING = Case({"K": 1.5, "T": 0.2, "L": 0.0737})
-WRITTEN: dict[str, tuple[Model, Case]] = {
+_HISTORY = ExportCase({"K": 0.5, "T": 0.2, "L": 0.0737, "w(0)": 0.4})
+_RESTING = ExportCase({"K": 1.5, "T": 0.2, "L": 0.0737})
+WRITTEN: dict[str, tuple[Model, ExportCase]] = {
     "rk4": (written(TWO), _TWO),
     "rk4_substeps": (written(TWO, substeps=3), _TWO),
     "rk4_linear": (written(TWO, interpolation="linear"), _TWO),
@@ -301,7 +309,7 @@ WRITTEN: dict[str, tuple[Model, Case]] = {
     "steady_own_step": (starting(RESTING, "steady", step=0.017), _RESTING),
     "steady_off_samples": (starting(RESTING, "steady", step=0.0171), _RESTING),
     "start_of_recursion": (starting(RECURSION, {"x": "d*u0 - L", "w": "u0/d"}), _RECURSION),
-    "selected": (selected(), Case({"d": 1.6, **COEFFICIENTS, "y(0)": 0.1})),
+    "selected": (select_terms(), ExportCase({"d": 1.6, **COEFFICIENTS, "y(0)": 0.1})),
     "recursion": (written(RECURSION), _RECURSION),
     "recursion_cubic": (written(RECURSION, interpolation="cubic", history="zero"), _RECURSION),
     "recursion_substeps": (written(RECURSION, substeps=3), _RECURSION),
@@ -312,7 +320,7 @@ MODELS = {
 } | WRITTEN
 
 
-def excitation(model: Model, case: Case) -> tuple[FloatArray, dict[str, FloatArray]]:
+def make_excitation(model: Model, case: ExportCase) -> tuple[FloatArray, dict[str, FloatArray]]:
     draw = np.random.default_rng(7)
     times = 1.5 + case.h * np.arange(N)
     levels = case.amplitude * np.array([0.0, 1.0, 0.4, -1.0])
@@ -343,7 +351,9 @@ EXPORTS = [
 
 
 @pytest.fixture(scope="module")
-def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+def c_library(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> ctypes.CDLL:
     """The models of the tests that run as C in one library, for the holds of their inputs."""
     sources = {}
     for item in request.session.items:
@@ -353,23 +363,23 @@ def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         model, case = MODELS[name]
         holds = {one.name: hold for one in model.inputs}
         text = sysid.export_model(model, case.values, "c", hold=holds)
-        plain = with_entry(text, f"run_{hold}_{name}", len(model.inputs), len(model.outputs))
+        plain = add_entry(text, f"run_{hold}_{name}", len(model.inputs), len(model.outputs))
         stem = text.split("_identified(void)")[0].split()[-1]
         sources[f"{name}_{hold}"] = plain.replace(f"{stem}_", f"{name}_{hold}_own_")
-    return compiled(tmp_path_factory.mktemp("exported"), sources)
+    return compile_library(tmp_path_factory.mktemp("exported"), sources)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "hold"), EXPORTS)
 def test_exported_programs_compute_what_the_simulation_does(
-    name: str, hold: Hold, built: ctypes.CDLL
+    name: str, hold: Hold, c_library: ctypes.CDLL
 ) -> None:
     model, case = MODELS[name]
-    times, inputs = excitation(model, case)
-    expected = simulated(model, case.values, times, inputs, hold)
+    times, inputs = make_excitation(model, case)
+    expected = simulate_outputs(model, case.values, times, inputs, hold)
     text = sysid.export_model(model, case.values, "python", hold=dict.fromkeys(inputs, hold))
-    python = in_python(text, times, list(inputs.values()))
-    c = in_c(built, f"run_{hold}_{name}", times, list(inputs.values()), len(model.outputs))
+    python = run_python(text, times, list(inputs.values()))
+    c = run_c(c_library, f"run_{hold}_{name}", times, list(inputs.values()), len(model.outputs))
     for told, *found in zip(expected, python, c, strict=True):
         assert np.ptp(told) > 0
         for one in found:
@@ -387,10 +397,10 @@ def test_a_lag_without_a_value_is_none() -> None:
     text = sysid.export_model(model, {"K": 1, "T": 1, "L": 0}, "python")
     times, u, q = 0.1 * np.arange(9), np.ones(9), np.ones(9)
     u[4] = q[4] = 0.0
-    assert np.all(np.isfinite(in_python(text, times, [u, q])[0]))
+    assert np.all(np.isfinite(run_python(text, times, [u, q])[0]))
 
 
-def case_of(name: str) -> tuple[Model, Case]:
+def case_of(name: str) -> tuple[Model, ExportCase]:
     return load_model(name), CASES[name]
 
 
@@ -407,10 +417,10 @@ def test_the_document_has_all_that_is_needed_to_simulate_again() -> None:
     units = document["data"].pop("units")
     assert units == {"i": "N", "q": "N", "int": "1", "step": "1"}
     assert document["data"] == {"sample_time": 0.05, "hold": {"i": "zero", "q": "first"}}
-    times, inputs = excitation(model, case)
+    times, inputs = make_excitation(model, case)
     for one, other in zip(
-        simulated(again, values, times, inputs, "first"),
-        simulated(model, case.values, times, inputs, "first"),
+        simulate_outputs(again, values, times, inputs, "first"),
+        simulate_outputs(model, case.values, times, inputs, "first"),
         strict=True,
     ):
         np.testing.assert_array_equal(one, other)
@@ -422,7 +432,7 @@ def test_an_identification_is_exported_with_its_uncertainty() -> None:
     u = np.where(times % 3 < 1.5, 0.0, 1.0)
     truth = {"K": 1.0, "T": 0.3, "L": 0.21, "y(0)": 0.0}
     noise = np.random.default_rng(1).normal(0, 0.01, times.size)
-    y = simulated(model, truth, times, {"u": u}, "zero")[0] + noise
+    y = simulate_outputs(model, truth, times, {"u": u}, "zero")[0] + noise
     record = sysid.Record(
         (sysid.Channel("u", times, u, "V", hold="zero"),), (sysid.Channel("y", times, y, "bar"),)
     )
@@ -443,16 +453,16 @@ def test_an_identification_is_exported_with_its_uncertainty() -> None:
     text = sysid.export_model(model, found, "python")  # held as the data of the result were
     assert f"standard error {stderr['T']:.3g}" in text
     # The tube starts where it was measured, so that is to be given.
-    expected = simulated(
+    expected = simulate_outputs(
         model,
         {one.name: one.value for one in found.parameters} | {"y(0)": y[0]},
         times,
         {"u": u},
         "zero",
     )
-    np.testing.assert_allclose(in_python(text, times, [u], y_0=y[0]), expected, rtol=1e-9)
+    np.testing.assert_allclose(run_python(text, times, [u], y_0=y[0]), expected, rtol=1e-9)
     with pytest.raises(TypeError, match="y_0"):
-        in_python(text, times, [u])
+        run_python(text, times, [u])
 
 
 # ---- what is refused, and what names and titles may hold ------------------------------------

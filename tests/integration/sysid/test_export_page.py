@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 PAGE = (ROOT / "docs/export.md").read_text(encoding="utf-8")
 SNIPPETS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)

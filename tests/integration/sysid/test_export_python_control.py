@@ -14,7 +14,7 @@ from sysid.data.records import Hold
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
-from tests.exporting import in_control, simulated
+from tests.support.library.exported_programs import run_control, simulate_outputs
 
 N = 240
 VALUES: dict[str, dict[str, float]] = {
@@ -62,7 +62,7 @@ def test_a_transfer_function_is_that_of_the_equations(name: str) -> None:
         model, values = parse_model(DELAYED_DAMPER), {"L": 0.3, "c": 0.4}
     else:
         model, values = load_model(name), VALUES[name]
-    script = in_control(sysid.export_model(model, values, "control", pade_order=4))
+    script = run_control(sysid.export_model(model, values, "control", pade_order=4))
     assert set(script["pairs"]) == set(script["systems"]) == set(EXPECTED[name])
     for pair, expected in EXPECTED[name].items():
         exact = script["response"](script["pairs"][pair], OMEGA)
@@ -73,10 +73,10 @@ def test_a_transfer_function_is_that_of_the_equations(name: str) -> None:
 
 def test_the_frequency_response_is_that_of_the_simulation() -> None:
     model, values = parse_model(DELAYED_DAMPER), {"L": 0.3, "c": 0.4}
-    script = in_control(sysid.export_model(model, values, "control"))
+    script = run_control(sysid.export_model(model, values, "control"))
     times, omega = 0.01 * np.arange(12_000), 1.0
     inputs = {"q": np.sin(omega * times), "r": np.zeros(times.size)}
-    outputs = simulated(model, values, times, inputs, "first")
+    outputs = simulate_outputs(model, values, times, inputs, "first")
     last = times > times[-1] - 4 * np.pi / omega
     columns = [np.sin(omega * times[last]), np.cos(omega * times[last]), np.ones(int(last.sum()))]
     for output, signal in zip(("y", "z"), outputs, strict=True):
@@ -112,7 +112,7 @@ def test_a_recursion_filters_as_its_transfer_function_in_z(
     model = recursion_with(interpolation=interpolation, substeps=substeps)
     values, h = {"L": lag, "d": 1.3}, 0.05
     text = sysid.export_model(model, values, "control", sample_time=h, hold={"u": hold})
-    script = in_control(text)
+    script = run_control(text)
     assert script["period"] == h / substeps
     times = h * np.arange(N)
     u = np.repeat(np.random.default_rng(2).choice([0.0, 1.0, -0.5], N // 12), 12)
@@ -120,26 +120,28 @@ def test_a_recursion_filters_as_its_transfer_function_in_z(
     fine = np.arange((N - 1) * substeps + 1) / substeps
     between = np.interp(fine, np.arange(N), u) if hold == "first" else u[fine.astype(int)]
     for output, told in zip(
-        ("y", "z"), simulated(model, values, times, {"u": u}, hold), strict=True
+        ("y", "z"), simulate_outputs(model, values, times, {"u": u}, hold), strict=True
     ):
         found = lfilter(*script["pairs"]["u", output], between)[::substeps]
         np.testing.assert_allclose(found, told, rtol=1e-9, atol=1e-9)
 
 
-def refused(model: Model, values: dict[str, float], **given: Any) -> str:
+def read_refusal(model: Model, values: dict[str, float], **given: Any) -> str:
     with pytest.raises((NotLinear, InvalidSettings)) as caught:
         sysid.export_model(model, values, "control", **given)
     return str(caught.value)
 
 
 def test_what_has_no_transfer_function_is_refused_with_the_term_in_the_way() -> None:
-    assert "x**3" in refused(load_model("duffing-delay"), {"c": 0.2, "L": 0.5, "b": 5, "a": 1})
-    assert "sign" in refused(
+    assert "x**3" in read_refusal(load_model("duffing-delay"), {"c": 0.2, "L": 0.5, "b": 5, "a": 1})
+    assert "sign" in read_refusal(
         load_model("emps"), {"M": 95, "Fv": 200, "Fc": 20, "o": -3}, sample_time=0.01
     )
-    assert "no input" in refused(load_model("delayed-logistic"), {"r": 1, "K": 2, "L": 1})
+    assert "no input" in read_refusal(load_model("delayed-logistic"), {"r": 1, "K": 2, "L": 1})
     recursion = recursion_with()
-    assert "sampling period" in refused(recursion, {"L": 0.1, "d": 1.0})
+    assert "sampling period" in read_refusal(recursion, {"L": 0.1, "d": 1.0})
     changing = yaml.safe_load(LINEAR_RECURSION)
     changing["equations"]["x"] = "0.1*t*u"
-    assert "changes with t" in refused(parse_model(changing), {"L": 0.1, "d": 1.0}, sample_time=1.0)
+    assert "changes with t" in read_refusal(
+        parse_model(changing), {"L": 0.1, "d": 1.0}, sample_time=1.0
+    )

@@ -10,13 +10,13 @@ from sysid import Channel, Record, identify, load_model, simulate
 from sysid.core.types import FloatArray
 from sysid.data.interpolation import interpolate_input
 from sysid.models.catalogue.load import copy_catalogue_document
-from tests.profiles import draw_seeds
-from tests.rates import bound_count
+from tests.support.profiles import draw_seeds
+from tests.support.random_bounds import bound_count
 
 T, K = 4.0, 2.0  # s, 1; sampled once a second
 
 
-def steps(seed: int, samples: int = 300) -> FloatArray:
+def make_steps(seed: int, samples: int = 300) -> FloatArray:
     """An input that is held for ten samples at a time."""
     levels = np.random.default_rng(seed).choice([0.0, 1.0], samples // 10)
     return np.asarray(np.repeat(levels, 10))
@@ -35,7 +35,7 @@ def exact(u: FloatArray, lag: float) -> FloatArray:
     return y
 
 
-def record(u: FloatArray, y: FloatArray) -> Record:
+def make_record(u: FloatArray, y: FloatArray) -> Record:
     times = np.arange(float(u.size))
     return Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
 
@@ -43,7 +43,7 @@ def record(u: FloatArray, y: FloatArray) -> Record:
 @pytest.mark.parametrize("lag", [0.0, 0.1, 1.0, 2.37, 3.5, 4.999])
 @pytest.mark.parametrize("substeps", [2, 8])
 def test_the_response_is_that_of_the_plant(lag: float, substeps: int) -> None:
-    u = steps(3)
+    u = make_steps(3)
     model = load_model(
         {**copy_catalogue_document("tube"), "solver": {"method": "rk4", "substeps": substeps}}
     )
@@ -57,7 +57,7 @@ def test_the_response_is_that_of_the_plant(lag: float, substeps: int) -> None:
 
 
 def test_the_response_moves_with_the_lag_without_stairs() -> None:
-    u, model = steps(3), load_model("tube")
+    u, model = make_steps(3), load_model("tube")
     inputs = [Channel("u", np.arange(300.0), u, hold="zero")]
     lags = np.linspace(2.0, 3.0, 41)
     curves = [
@@ -75,8 +75,8 @@ def test_intervals_of_a_lag_cover_it() -> None:
     missed, seeds = [], draw_seeds(gate=12, night=300)
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        lag, u = rng.uniform(0.2, 4.8), steps(seed)
-        data = record(u, exact(u, lag) + rng.normal(0, 0.01, u.size))
+        lag, u = rng.uniform(0.2, 4.8), make_steps(seed)
+        data = make_record(u, exact(u, lag) + rng.normal(0, 0.01, u.size))
         bounds: dict[str, Any] = {"T": {"upper": 20.0}, "L": {"upper": 10.0}}
         found = identify(load_model("fopdt"), [data], parameters=bounds, seed=seed)
         (estimate,) = (one for one in found.parameters if one.name == "L")

@@ -31,47 +31,54 @@ def step_test(noise: float = 0.0) -> Recording:
     )
 
 
-def fitted(recording: Recording, hold: Mapping[str, Hold] | None = None) -> Identification:
+def identify_with_hold(
+    recording: Recording, hold: Mapping[str, Hold] | None = None
+) -> Identification:
     record = recording.to_record({"u": "u"}, {"y": "y"})
     search = GeneticAlgorithm(generations=100)
     return identify(load_model("fopdt"), record, search, hold=hold, compare_orders=False)
 
 
-def lag(found: Identification) -> float:
+def build_lag(found: Identification) -> float:
     return next(one.value for one in found.parameters if one.name == "L")
 
 
 def test_a_held_input_gives_the_true_lag_of_a_step_test() -> None:
-    assert lag(fitted(step_test().replace_holds({"u": "zero"}))) == pytest.approx(LAG, abs=0.02)
+    assert build_lag(identify_with_hold(step_test().replace_holds({"u": "zero"}))) == pytest.approx(
+        LAG, abs=0.02
+    )
 
 
 def test_a_step_is_held_without_being_told() -> None:
-    found = fitted(step_test())
+    found = identify_with_hold(step_test())
     (hold,) = found.input_hold
-    assert lag(found) == pytest.approx(LAG, abs=0.02)
+    assert build_lag(found) == pytest.approx(LAG, abs=0.02)
     assert (hold.input, hold.chosen, hold.other) == ("u", "zero", "first")
     assert hold.reason == "has two levels"
 
 
 def test_the_estimate_of_the_other_reading_is_told() -> None:
     recording = step_test(noise=0.01)
-    found, lines = fitted(recording), fitted(recording.replace_holds({"u": "first"}))
+    found, lines = (
+        identify_with_hold(recording),
+        identify_with_hold(recording.replace_holds({"u": "first"})),
+    )
     (hold,) = found.input_hold
     assert hold.estimates_other is not None
-    assert hold.estimates_other["L"] == pytest.approx(lag(lines), abs=1e-4)
+    assert hold.estimates_other["L"] == pytest.approx(build_lag(lines), abs=1e-4)
     assert hold.rms_other == pytest.approx(lines.rms, rel=1e-3)
     told = [one for one in found.warnings if "(hold={'u': 'first'})" in one]
     assert len(told) == 1
-    assert f"L = {lag(lines):.4g} s instead of {lag(found):.4g}" in told[0]
+    assert f"L = {build_lag(lines):.4g} s instead of {build_lag(found):.4g}" in told[0]
     assert found.evaluations > lines.evaluations
-    same = fitted(recording, {"u": "first"})
+    same = identify_with_hold(recording, {"u": "first"})
     assert same.parameter_values == lines.parameter_values
     assert same.input_hold == lines.input_hold
 
 
 @pytest.mark.parametrize("hold", ["zero", "first"])
 def test_of_a_given_hold_nothing_is_told(hold: Hold) -> None:
-    found = fitted(step_test().replace_holds({"u": hold}))
+    found = identify_with_hold(step_test().replace_holds({"u": hold}))
     assert not any("hold" in one for one in found.warnings)
     assert found.input_hold == (InputHold("u", hold, None),)
 
@@ -97,7 +104,7 @@ def moving_test() -> Recording:
 
 
 def test_a_reading_that_fits_worse_than_the_other_is_told() -> None:
-    found = fitted(moving_test())
+    found = identify_with_hold(moving_test())
     assert found.input_hold[0].chosen == "first"
     assert any("(hold={'u': 'zero'})" in one and "fits better" in one for one in found.warnings)
     assert found["L"].status == "hold-dependent"
@@ -120,12 +127,12 @@ def run_plant(seed: int, gain: float) -> Recording:
 
 
 def test_the_command_of_a_loop_may_be_held_and_the_lag_depends_on_it() -> None:
-    found = fitted(run_plant(1, 0.8))
+    found = identify_with_hold(run_plant(1, 0.8))
     (hold,) = found.input_hold
     assert (hold.chosen, found["L"].status) == ("first", "hold-dependent")
     assert any("as a command does" in one for one in found.warnings)
     assert found.verdict.trust == "limited"
-    held = fitted(run_plant(1, 0.8), {"u": "zero"})
+    held = identify_with_hold(run_plant(1, 0.8), {"u": "zero"})
     assert held["L"].value == pytest.approx(3.0, abs=0.1)
     assert held["L"].status == "identified"
     assert held.verdict.text == "trustworthy"
@@ -135,7 +142,7 @@ def test_a_new_level_at_every_sample_is_no_line() -> None:
     moving = moving_test()
     u, y = (moving.channel(name) for name in "uy")
     noisy = y.values + 0.1 * np.random.default_rng(4).standard_normal(200)
-    found = fitted(Recording((u, Channel("y", y.times, noisy, "bar"))))
+    found = identify_with_hold(Recording((u, Channel("y", y.times, noisy, "bar"))))
     assert found["L"].status == "hold-dependent"
     assert any("do not follow each other" in one for one in found.warnings)
 
@@ -145,7 +152,9 @@ def test_a_smooth_input_of_an_open_loop_is_read_as_lines_without_a_word() -> Non
     u, slow = np.sin(0.15 * times), 1 / (1 + 0.15j * 8) * np.exp(-0.15j * LAG)
     y = 1.5 * np.imag(slow * np.exp(0.15j * times))
     y += 0.02 * np.random.default_rng(1).standard_normal(400)
-    found = fitted(Recording((Channel("u", times, u, "V"), Channel("y", times, y, "bar"))))
+    found = identify_with_hold(
+        Recording((Channel("u", times, u, "V"), Channel("y", times, y, "bar")))
+    )
     assert found.input_hold[0].chosen == "first"
     assert "hold-dependent" not in [one.status for one in found.parameters]
     assert not any("hold=" in one for one in found.warnings)
@@ -168,12 +177,12 @@ def test_jumps_between_irregular_samples_are_uncertain() -> None:
         x[k] = x[k - 1] + 0.01 / 8 * (1.5 * u[k - 1] - x[k - 1])
     measured = np.interp(times, fine, x) + 1e-3 * rng.standard_normal(200)
     record = (Channel("u", times, drive(times), "V"), Channel("y", times, measured, "bar"))
-    found = fitted(Recording(record))
+    found = identify_with_hold(Recording(record))
     assert found.input_hold[0].chosen == "zero"
     (told,) = [one for one in found.warnings if "sampled irregularly" in one]
     period = float(told.split(", ")[-1].removesuffix(" s"))
     assert 0.4 < period < 0.9
-    assert abs(lag(found) - LAG) < period
+    assert abs(build_lag(found) - LAG) < period
 
 
 def test_the_validation_part_is_read_as_the_estimation_part() -> None:

@@ -12,20 +12,20 @@ from sysid.islands.state import RunState
 from sysid.models.catalogue.load import load_model
 from sysid.results.identification import Identification
 from sysid.search.refine import refine_candidates
-from tests.searching import COULOMB, DUFFING, clean, example, noisy, record
+from tests.support.library.search_problems import COULOMB, DUFFING, clean, example, noisy, record
 
 DUFFING_MODEL = load_model("duffing-eq16")
 COULOMB_MODEL = load_model("coulomb-eq16")
 
 
-def values(found: Identification) -> dict[str, float]:
+def read_values(found: Identification) -> dict[str, float]:
     return {estimate.name: estimate.value for estimate in found.parameters}
 
 
 @pytest.mark.parametrize(("model", "truth"), [("duffing-eq16", DUFFING), ("coulomb-eq16", COULOMB)])
 def test_the_truth_is_recovered_without_noise(model: str, truth: dict[str, float]) -> None:
     found = identify(load_model(model), record(clean(model)))
-    assert values(found) == pytest.approx(truth, abs=1e-6)
+    assert read_values(found) == pytest.approx(truth, abs=1e-6)
     assert found.rms < 1e-7
     assert found.fit_percent.estimation > 99.999
 
@@ -59,7 +59,7 @@ def test_the_methods_of_the_paper_are_reported_as_found() -> None:
         settings = GeneticAlgorithm(method=method)  # type: ignore[arg-type]
         found = identify(DUFFING_MODEL, record(noisy()), settings)
         best = min(found.history, key=lambda steps: steps[-1].rms)[-1]
-        assert tuple(values(found).values()) == best.parameters
+        assert tuple(read_values(found).values()) == best.parameters
         assert found.islands[0].refined_rms is None
         assert any("not a local optimum" in warning for warning in found.warnings)
         assert all(estimate.stderr is not None for estimate in found.parameters)
@@ -104,7 +104,7 @@ def test_a_robust_loss_withstands_outliers() -> None:
     y = noisy()
     y[::20] += 2.0
     found = identify(DUFFING_MODEL, record(y), loss=Loss("soft-l1", 0.02))
-    assert values(found)["L"] == pytest.approx(0.5, abs=0.02)
+    assert read_values(found)["L"] == pytest.approx(0.5, abs=0.02)
 
 
 def test_a_result_above_the_safe_limit_is_not_valid() -> None:

@@ -9,7 +9,7 @@ import pytest
 from service.formats.csv_recordings import read_csv
 from sysid.data.derivations import derive_recording
 from sysid.data.records import Recording
-from tests.needs import DATA
+from tests.support.requirements import DATA
 
 LABELS = ("length_m", "p_nom_bar", "phase", "file", "repeat")
 

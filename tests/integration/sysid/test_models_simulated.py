@@ -12,7 +12,7 @@ from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.simulation.simulate import simulate as simulate_compiled
-from tests.meaning import simulate as simulate_plainly
+from tests.support.library.expression_values import simulate as simulate_plainly
 
 H, N = 0.02, 150
 FORCE = 10.0 * np.cos(5.0 * H * np.arange(N)) + 0.3

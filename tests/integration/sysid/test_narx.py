@@ -18,7 +18,14 @@ from sysid.results.identification import Identification
 from sysid.selection.starts import find_equation_error_starts
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
-from tests.polynomials import LAGGED, TRUTH, document, frols, lagged, record_of
+from tests.support.library.polynomials import (
+    LAGGED,
+    TRUTH,
+    build_lagged,
+    document,
+    frols,
+    record_of,
+)
 
 NARX = {
     "a[y(k-1)]": 0.5,
@@ -44,11 +51,11 @@ def narx_record(dh: float, dk: float, noise: float = 0.0, samples: int = 500) ->
     return Record((source,), (Channel("y", times, clean + noise * rng.standard_normal(samples)),))
 
 
-def values(found: Identification) -> dict[str, float]:
+def read_values(found: Identification) -> dict[str, float]:
     return {one.name: one.value for one in found.parameters}
 
 
-def problem(record: Record, **fields: Any) -> Problem:
+def build_problem(record: Record, **fields: Any) -> Problem:
     return Problem.build(load_model("narx"), [record], **fields)
 
 
@@ -66,7 +73,7 @@ def test_all_coefficients_and_both_lags_of_the_catalogue_model_are_recovered(
     model = load_model("narx")
     truth = {one.name: 0.0 for one in model.parameters} | NARX | {"dh": dh, "dk": dk}
     found = identify(model, narx_record(dh, dk))
-    assert values(found) == pytest.approx(truth, abs=1e-6)
+    assert read_values(found) == pytest.approx(truth, abs=1e-6)
 
 
 @pytest.mark.slow
@@ -84,23 +91,23 @@ def test_with_measurement_noise_they_are_recovered_within_their_errors() -> None
 
 
 def test_the_starts_hold_the_solution_of_data_without_noise() -> None:
-    posed = problem(narx_record(3.0, 7.0))
+    posed = build_problem(narx_record(3.0, 7.0))
     starts = find_equation_error_starts(posed, GeneticAlgorithm())
     assert starts.values[0] == pytest.approx(
         {one.name: 0.0 for one in posed.free_parameters} | NARX | {"dh": 3.0, "dk": 7.0}, abs=1e-9
     )
 
 
-def fitness(posed: Problem, start: Any) -> float:
+def compute_fitness(posed: Problem, start: Any) -> float:
     theta = np.array([[start[one.name] for one in posed.free_parameters]])
     return float(posed.evaluate_fitness(theta)[0])
 
 
 def test_starts_come_best_first_inside_the_bounds_and_finite() -> None:
     changes = {"a[u(k-1)]": {"lower": -0.1, "upper": 0.1}, "dk": {"upper": 5}}
-    posed = problem(narx_record(3.0, 7.0, noise=0.1), parameters=changes)
+    posed = build_problem(narx_record(3.0, 7.0, noise=0.1), parameters=changes)
     starts = find_equation_error_starts(posed, GeneticAlgorithm()).values
-    reached = [fitness(posed, start) for start in starts]
+    reached = [compute_fitness(posed, start) for start in starts]
     assert reached == sorted(reached)
     assert np.isfinite(reached[-1])
     for start in starts:
@@ -126,7 +133,7 @@ def test_a_fixed_coefficient_is_kept_and_the_others_are_solved_for() -> None:
 
 
 def test_the_methods_of_the_paper_begin_without_starts() -> None:
-    posed = problem(narx_record(3.0, 7.0))
+    posed = build_problem(narx_record(3.0, 7.0))
     for method in ("simple", "improved-paper"):
         algorithm = GeneticAlgorithm(method=method)
         assert find_equation_error_starts(posed, algorithm).values == ()
@@ -151,7 +158,7 @@ def test_a_model_that_is_no_polynomial_has_no_starts() -> None:
 )
 def test_simulations_of_the_starts_count(evaluations: int) -> None:
     algorithm = GeneticAlgorithm(stop=Stop(evaluations=evaluations))
-    posed = problem(narx_record(3.0, 7.0, noise=0.05))
+    posed = build_problem(narx_record(3.0, 7.0, noise=0.05))
     starts = find_equation_error_starts(posed, algorithm)
     assert 0 < starts.evaluations <= evaluations // 4
     assert begin_run(posed, algorithm, 1).evaluations == starts.evaluations
@@ -160,14 +167,14 @@ def test_simulations_of_the_starts_count(evaluations: int) -> None:
 
 
 def selecting(**changes: Any) -> Model:
-    return parse_model(lagged(frols(5), **changes))
+    return parse_model(build_lagged(frols(5), **changes))
 
 
 def test_selected_terms_are_told_with_the_result_and_searched_with_their_lags() -> None:
     found = identify(selecting(), record_of(LAGGED, lags={"dh": 2.4, "dk": 5.6}), SMALL)
     assert {one.term for one in found.selection} == set(LAGGED)
     truth = {f"a[{term}]": value for term, value in LAGGED.items()} | {"dh": 2.4, "dk": 5.6}
-    assert values(found) == pytest.approx(truth, abs=1e-5)
+    assert read_values(found) == pytest.approx(truth, abs=1e-5)
     cumulated = np.cumsum([one.err for one in found.selection])
     assert [one.cumulated for one in found.selection] == pytest.approx(list(cumulated))
 
@@ -192,7 +199,7 @@ def test_the_same_selection_repeats_bit_for_bit() -> None:
     record = record_of(LAGGED, lags={"dh": 2.4, "dk": 5.6}, noise=0.05)
     one, other = (identify(selecting(), record, SMALL) for _ in range(2))
     assert one.selection == other.selection
-    assert values(one) == values(other)
+    assert read_values(one) == read_values(other)
 
 
 @pytest.mark.parametrize("islands", [1, 4])

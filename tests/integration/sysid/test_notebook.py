@@ -43,8 +43,8 @@ from sysid.results.result import FitPercent
 from sysid.results.saved_result import FORMAT
 from sysid.results.summary import summarise_result
 from sysid.uncertainty.estimates import CorrelationMatrix, Posterior
-from tests.polynomials import TRUTH as POLYNOMIAL
-from tests.polynomials import document, frols, record_of
+from tests.support.library.polynomials import TRUTH as POLYNOMIAL
+from tests.support.library.polynomials import document, frols, record_of
 
 N = 240
 T = np.arange(N) * 0.5
@@ -72,12 +72,12 @@ def frame() -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def found(frame: pd.DataFrame) -> Identification:
+def frame_result(frame: pd.DataFrame) -> Identification:
     return identify("fopdt", frame, QUICK, parameters=FEW, validation_fraction=0.25)
 
 
 @pytest.fixture(scope="module")
-def sampled(frame: pd.DataFrame) -> Identification:
+def posterior_result(frame: pd.DataFrame) -> Identification:
     """A result of two records, with other validation data and a posterior."""
     parts = [frame.iloc[:150], frame.iloc[100:]]
     return identify("fopdt", parts, QUICK, parameters=FEW, validation=frame, posterior=True)
@@ -101,10 +101,12 @@ def same(one: Any, other: Any) -> bool:
     return type(one) is type(other) and one == other
 
 
-def test_a_table_of_dates_gives_the_truth_and_says_how_it_was_read(found: Identification) -> None:
+def test_a_table_of_dates_gives_the_truth_and_says_how_it_was_read(
+    frame_result: Identification,
+) -> None:
     for name in ("K", "T", "L"):
-        assert found[name].value == pytest.approx(TRUTH[name], rel=0.05)
-    assert "'u': 'Heizung', 'y': 'Temperatur'" in found.warnings[0]
+        assert frame_result[name].value == pytest.approx(TRUTH[name], rel=0.05)
+    assert "'u': 'Heizung', 'y': 'Temperatur'" in frame_result.warnings[0]
 
 
 def test_every_form_of_the_same_data_gives_the_same_result(frame: pd.DataFrame) -> None:
@@ -128,71 +130,71 @@ def test_every_form_of_the_same_data_gives_the_same_result(frame: pd.DataFrame) 
     }
 
 
-def test_bounds_and_fixed_values_have_a_short_form(found: Identification) -> None:
-    assert (found["L"].lower, found["L"].upper) == (0.0, 10.0)
-    assert (found["y0"].value, found["y0"].status) == (20.0, "fixed")
+def test_bounds_and_fixed_values_have_a_short_form(frame_result: Identification) -> None:
+    assert (frame_result["L"].lower, frame_result["L"].upper) == (0.0, 10.0)
+    assert (frame_result["y0"].value, frame_result["y0"].status) == (20.0, "fixed")
 
 
-def test_a_result_is_a_few_lines(found: Identification) -> None:
-    text = repr(found)
+def test_a_result_is_a_few_lines(frame_result: Identification) -> None:
+    text = repr(frame_result)
     head, verdict, *rows = text.splitlines()
-    assert verdict == f"verdict: {found.verdict.text}"
+    assert verdict == f"verdict: {frame_result.verdict.text}"
     assert head.startswith(
-        f"Identification of 'fopdt', fit {found.fit_percent.estimation:.2f} %, RMS 0.1"
+        f"Identification of 'fopdt', fit {frame_result.fit_percent.estimation:.2f} %, RMS 0.1"
     )
     assert "°C, validation fit" in head
-    assert rows[0].split()[:3] == ["K", *summarise_estimate(found, "K")]
-    assert all(f"  {estimate.name}" in text for estimate in found.parameters)
+    assert rows[0].split()[:3] == ["K", *summarise_estimate(frame_result, "K")]
+    assert all(f"  {estimate.name}" in text for estimate in frame_result.parameters)
     assert "residuals on validation data: " in text
     assert len(text) < 1500
-    many = replace(found, warnings=tuple(f"number {n} " + "x" * 500 for n in range(9)))
+    many = replace(frame_result, warnings=tuple(f"number {n} " + "x" * 500 for n in range(9)))
     *_, first, second, third, last = repr(many).splitlines()
     # The end of a note says what to do, so none is cut.
     assert [first, second, third] == [f"note: {warning}" for warning in many.warnings[:3]]
     assert last == "and 6 more in `warnings`"
 
 
-def summarise_estimate(found: Identification, name: str) -> list[str]:
-    estimate = found[name]
-    row = next(line for line in summarise_result(found).splitlines() if f" {name} " in line)
+def summarise_estimate(frame_result: Identification, name: str) -> list[str]:
+    estimate = frame_result[name]
+    row = next(line for line in summarise_result(frame_result).splitlines() if f" {name} " in line)
     value = float(row.split()[1])
     assert value == pytest.approx(estimate.value, abs=estimate.stderr)
     return row.split()[1:3]
 
 
-def test_the_html_of_a_result_is_complete_and_escaped(found: Identification) -> None:
-    evil = replace(found, warnings=("<script>alert(1)</script>", *found.warnings))
+def test_the_html_of_a_result_is_complete_and_escaped(frame_result: Identification) -> None:
+    evil = replace(frame_result, warnings=("<script>alert(1)</script>", *frame_result.warnings))
     html = evil._repr_html_()
     assert "<script>" not in html
     assert "&lt;script&gt;" in html
-    for estimate in found.parameters:
+    for estimate in frame_result.parameters:
         assert f"<b>{estimate.name}</b>" in html
     assert html.count("<li>") == len(evil.warnings)
     assert "residuals on validation data" in html
 
 
-def test_an_estimate_has_its_name(found: Identification) -> None:
-    assert found["T"] is found.parameters[1]
-    assert list(found) == [estimate.name for estimate in found.parameters]
-    assert "T" in found
-    assert "TT" not in found
-    assert found.parameter_values["T"] == found["T"].value
+def test_an_estimate_has_its_name(frame_result: Identification) -> None:
+    assert frame_result["T"] is frame_result.parameters[1]
+    assert list(frame_result) == [estimate.name for estimate in frame_result.parameters]
+    assert "T" in frame_result
+    assert "TT" not in frame_result
+    assert frame_result.parameter_values["T"] == frame_result["T"].value
     with pytest.raises(UnknownParameter, match=r"there is no parameter 'TT'; did you mean 'T'\?"):
-        found["TT"]
+        frame_result["TT"]
     with pytest.raises(KeyError):
-        found["TT"]
+        frame_result["TT"]
 
 
-def test_estimates_are_a_table_of_pandas(found: Identification) -> None:
-    table = found.to_pandas()
-    assert list(table.index) == [estimate.name for estimate in found.parameters]
-    assert table.loc["L", "value"] == found["L"].value
-    assert table.loc["L", "low95"] == found["L"].interval95[0]
+def test_estimates_are_a_table_of_pandas(frame_result: Identification) -> None:
+    table = frame_result.to_pandas()
+    assert list(table.index) == [estimate.name for estimate in frame_result.parameters]
+    assert table.loc["L", "value"] == frame_result["L"].value
+    assert table.loc["L", "low95"] == frame_result["L"].interval95[0]
     assert np.isnan(table.loc["y0", "stderr"])
     assert table.loc["y0", "status"] == "fixed"
 
 
-@pytest.mark.parametrize("which", ["found", "sampled"])
+@pytest.mark.parametrize("which", ["frame_result", "posterior_result"])
 def test_a_result_is_saved_and_read_bit_for_bit(
     which: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
@@ -208,9 +210,9 @@ def test_a_result_is_saved_and_read_bit_for_bit(
     assert same(pickle.loads(pickle.dumps(result)), result)
 
 
-def test_numbers_that_json_lacks_are_saved(found: Identification, tmp_path: Path) -> None:
+def test_numbers_that_json_lacks_are_saved(frame_result: Identification, tmp_path: Path) -> None:
     odd = replace(
-        found,
+        frame_result,
         rms=float("inf"),
         fit_percent=FitPercent(float("nan"), None),
         simulated=((np.zeros(0),),),
@@ -219,8 +221,8 @@ def test_numbers_that_json_lacks_are_saved(found: Identification, tmp_path: Path
     path = tmp_path / "odd.json"
     odd.save(path)
     assert same(Identification.load(path), odd)
-    assert Identification.load(path) == odd != found
-    assert found != "found"
+    assert Identification.load(path) == odd != frame_result
+    assert frame_result != "found"
 
 
 DAMAGES = [
@@ -243,10 +245,10 @@ DAMAGES = [
 
 @pytest.mark.parametrize(("damage", "told"), DAMAGES)
 def test_a_damaged_file_is_told_by_its_field(
-    found: Identification, tmp_path: Path, damage, told: str
+    frame_result: Identification, tmp_path: Path, damage, told: str
 ) -> None:
     path = tmp_path / "found.json"
-    found.save(path)
+    frame_result.save(path)
     document = json.loads(path.read_text())
     damage(document)
     path.write_text(json.dumps(document))
@@ -272,42 +274,44 @@ def test_another_file_is_told(tmp_path: Path, content: str | None, told: str) ->
         Identification.load(path)
 
 
-def test_a_place_that_cannot_be_written_is_told(found: Identification, tmp_path: Path) -> None:
+def test_a_place_that_cannot_be_written_is_told(
+    frame_result: Identification, tmp_path: Path
+) -> None:
     with pytest.raises(UnwritableFile, match="cannot be written: No such file"):
-        found.save(tmp_path / "absent" / "found.json")
+        frame_result.save(tmp_path / "absent" / "found.json")
 
 
-def test_simulation_repeats_what_was_identified(found: Identification) -> None:
-    record = found.data.records[0]
+def test_simulation_repeats_what_was_identified(frame_result: Identification) -> None:
+    record = frame_result.data.records[0]
     assert np.array_equal(
-        simulate("fopdt", record, found).channel("y").values, found.simulated[0][0]
+        simulate("fopdt", record, frame_result).channel("y").values, frame_result.simulated[0][0]
     )
 
 
 def test_simulation_of_a_table_reads_the_input_as_the_identification_did(
-    found: Identification, frame: pd.DataFrame
+    frame_result: Identification, frame: pd.DataFrame
 ) -> None:
-    answer = simulate("fopdt", frame["Heizung [%]"], found).channel("y").values
-    estimated = found.simulated[0][0]
+    answer = simulate("fopdt", frame["Heizung [%]"], frame_result).channel("y").values
+    estimated = frame_result.simulated[0][0]
     assert np.allclose(answer[: estimated.size], estimated, rtol=0, atol=1e-9)
-    held = simulate("fopdt", Channel("u", T, STEPS, hold="first"), found).channel("y").values
+    held = simulate("fopdt", Channel("u", T, STEPS, hold="first"), frame_result).channel("y").values
     assert not np.allclose(held, answer, rtol=1e-3)
 
 
-def test_simulation_has_the_step_of_the_result(found: Identification) -> None:
-    record, model = found.data.records[0], load_model("fopdt")
-    finer = simulate(model, record, replace(found, substeps=7)).channel("y").values
-    asked = simulate(replace_substeps(model, 7), record, found.parameter_values)
+def test_simulation_has_the_step_of_the_result(frame_result: Identification) -> None:
+    record, model = frame_result.data.records[0], load_model("fopdt")
+    finer = simulate(model, record, replace(frame_result, substeps=7)).channel("y").values
+    asked = simulate(replace_substeps(model, 7), record, frame_result.parameter_values)
     assert np.array_equal(finer, asked.channel("y").values)
-    assert not np.array_equal(finer, found.simulated[0][0])
+    assert not np.array_equal(finer, frame_result.simulated[0][0])
 
 
-def test_simulation_reads_an_input_as_the_result_did(found: Identification) -> None:
-    inputs, values = Channel("u", T, STEPS), found.parameter_values
+def test_simulation_reads_an_input_as_the_result_did(frame_result: Identification) -> None:
+    inputs, values = Channel("u", T, STEPS), frame_result.parameter_values
     assert inputs.effective_hold == "zero"
-    lines = replace(found, input_hold=(InputHold("u", "first", None),))
+    lines = replace(frame_result, input_hold=(InputHold("u", "first", None),))
     answer = simulate("fopdt", inputs, lines).channel("y").values
-    asked = replace_substeps(load_model("fopdt"), found.substeps)
+    asked = replace_substeps(load_model("fopdt"), frame_result.substeps)
     expected = simulate(asked, replace(inputs, hold="first"), values).channel("y").values
     assert np.array_equal(answer, expected)
 
@@ -321,10 +325,12 @@ def test_simulation_has_the_terms_of_the_result() -> None:
     assert np.allclose(answer, result.simulated[0][0], rtol=0, atol=1e-9)
 
 
-def test_simulation_of_several_records_starts_as_the_first(sampled: Identification) -> None:
-    record = sampled.data.records[0]
-    answer = simulate("fopdt", record, sampled).channel("y").values
-    assert np.array_equal(answer, sampled.simulated[0][0])
+def test_simulation_of_several_records_starts_as_the_first(
+    posterior_result: Identification,
+) -> None:
+    record = posterior_result.data.records[0]
+    answer = simulate("fopdt", record, posterior_result).channel("y").values
+    assert np.array_equal(answer, posterior_result.simulated[0][0])
 
 
 @pytest.mark.parametrize("name", ["tube", "narx"])
@@ -344,17 +350,19 @@ def test_simulation_starts_where_the_measurement_started(name: str) -> None:
         simulate(name, record.inputs, replace(result, data=None))
 
 
-def test_an_exported_model_is_read_and_simulated(found: Identification, tmp_path: Path) -> None:
+def test_an_exported_model_is_read_and_simulated(
+    frame_result: Identification, tmp_path: Path
+) -> None:
     path = tmp_path / "model.json"
-    path.write_text(export_model(load_model("fopdt"), found, "json"), encoding="utf-8")
+    path.write_text(export_model(load_model("fopdt"), frame_result, "json"), encoding="utf-8")
     model = load_identified(path)
-    assert model.parameter_values == found.parameter_values
-    assert model.holds == found.holds
+    assert model.parameter_values == frame_result.parameter_values
+    assert model.holds == frame_result.holds
     assert "L = " in repr(model)
     assert len(repr(model)) < 300
-    record = found.data.records[0]
+    record = frame_result.data.records[0]
     answer = simulate(model.model, record, model).channel("y").values
-    assert np.allclose(answer, found.simulated[0][0], rtol=0, atol=1e-9)
+    assert np.allclose(answer, frame_result.simulated[0][0], rtol=0, atol=1e-9)
     assert export_model(model.model, model.parameter_values, "json")
 
 
@@ -380,9 +388,9 @@ def test_a_file_that_is_no_identified_model_is_told(
 
 
 def test_the_usual_figure_has_response_residuals_correlation_and_waterfall(
-    found: Identification,
+    frame_result: Identification,
 ) -> None:
-    figure = found.plot()
+    figure = frame_result.plot()
     assert isinstance(figure, go.Figure)
     titles = [note.text for note in figure.layout.annotations if note.text.startswith("<b>")]
     assert titles == [
@@ -395,27 +403,27 @@ def test_the_usual_figure_has_response_residuals_correlation_and_waterfall(
     measured = np.array(drawn["measured"].y)
     assert measured.size == N  # both parts of the record
     assert np.array(drawn["u"].y).size == N
-    assert np.array(drawn["identified"].y)[: found.simulated[0][0].size] == pytest.approx(
-        found.simulated[0][0], rel=1e-6
+    assert np.array(drawn["identified"].y)[: frame_result.simulated[0][0].size] == pytest.approx(
+        frame_result.simulated[0][0], rel=1e-6
     )
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_every_figure_can_be_drawn_alone(sampled: Identification, name: str) -> None:
-    figure = sampled.plot(name, theme="dark")
+def test_every_figure_can_be_drawn_alone(posterior_result: Identification, name: str) -> None:
+    figure = posterior_result.plot(name, theme="dark")
     assert figure.data
     assert figure.layout.template.layout.font.color == "#c6ced6"
 
 
-def test_figures_of_every_record(sampled: Identification) -> None:
-    names = [experiment.name for experiment in list_experiments(sampled)]
+def test_figures_of_every_record(posterior_result: Identification) -> None:
+    names = [experiment.name for experiment in list_experiments(posterior_result)]
     assert names == ["estimation 1", "estimation 2", "validation 1"]
-    [(title, _)] = draw_figures(sampled, ["response"], 2)
+    [(title, _)] = draw_figures(posterior_result, ["response"], 2)
     assert title == "Measured against identified: validation 1"
     with pytest.raises(InvalidSettings, match=r"found 3; the records are 0 \(estimation 1\)"):
-        sampled.plot(experiment=3)
+        posterior_result.plot(experiment=3)
     with pytest.raises(InvalidSettings, match=r"'respons'; did you mean 'response'\?"):
-        sampled.plot("respons")
+        posterior_result.plot("respons")
 
 
 def test_residuals_are_drawn_for_each_tested_record(frame: pd.DataFrame) -> None:
@@ -429,8 +437,8 @@ def test_residuals_are_drawn_for_each_tested_record(frame: pd.DataFrame) -> None
         assert bars[1] == pytest.approx(tested[1].values, rel=1e-5)
 
 
-def test_a_result_without_data_draws_what_it_has(found: Identification) -> None:
-    bare = replace(found, data=None)
+def test_a_result_without_data_draws_what_it_has(frame_result: Identification) -> None:
+    bare = replace(frame_result, data=None)
     titles = [title for title, _ in draw_figures(bare, FIGURES)]
     assert "Measured against identified" not in titles
     assert "What each island found" in titles
@@ -438,33 +446,33 @@ def test_a_result_without_data_draws_what_it_has(found: Identification) -> None:
 
 
 def test_a_picture_file_says_what_it_needs(
-    found: Identification, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    frame_result: Identification, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "kaleido", None)
     with pytest.raises(Exception, match="requires the Kaleido package") as told:
-        found.plot("response").write_image(tmp_path / "answer.svg")
+        frame_result.plot("response").write_image(tmp_path / "answer.svg")
     assert 'pip install --upgrade "kaleido>=1"' in str(told.value)
 
 
 @pytest.mark.parametrize(("library", "call"), [("pandas", "to_pandas"), ("plotly", "plot")])
 def test_a_missing_library_is_told(
-    found: Identification, monkeypatch: pytest.MonkeyPatch, library: str, call: str
+    frame_result: Identification, monkeypatch: pytest.MonkeyPatch, library: str, call: str
 ) -> None:
     monkeypatch.setitem(sys.modules, library, None)
     if library == "plotly":
         monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
     with pytest.raises(MissingLibrary, match=rf"{call}\(\) needs {library}, which is not inst"):
-        getattr(found, call)()
+        getattr(frame_result, call)()
 
 
 def test_drawn_residuals_are_those_that_were_tested(
-    found: Identification, sampled: Identification, frame: pd.DataFrame
+    frame_result: Identification, posterior_result: Identification, frame: pd.DataFrame
 ) -> None:
     robust = identify(
         "fopdt", frame, QUICK, parameters=FEW, loss=Loss("soft-l1", scale=0.2), skip=7
     )
     one_step = identify("narx", frame, QUICK, prediction="one-step")
-    for result in (found, sampled, robust, one_step):
+    for result in (frame_result, posterior_result, robust, one_step):
         verdict = judge_tests(result.data.correlations, result.residual_tests.data)
         assert verdict == result.residual_tests
 
@@ -534,11 +542,11 @@ def test_a_wrong_argument_of_a_simulation_is_told(inputs, values, more, told: st
 
 
 def test_a_result_simulates_the_table_that_it_was_identified_from(
-    found: Identification, frame: pd.DataFrame, tmp_path: Path
+    frame_result: Identification, frame: pd.DataFrame, tmp_path: Path
 ) -> None:
     path = tmp_path / "found.json"
-    found.save(path)
-    for result in (found, Identification.load(path)):
+    frame_result.save(path)
+    for result in (frame_result, Identification.load(path)):
         simulated = simulate("fopdt", frame, result).channel("y")
         assert simulated.values.size == N
         one = simulate("fopdt", frame[["Heizung [%]"]].rename(columns={"Heizung [%]": "u"}), result)
@@ -557,40 +565,44 @@ def test_a_result_simulates_the_table_that_it_was_identified_from(
     ],
 )
 def test_a_wrong_argument_of_plot_is_told(
-    found: Identification, names: tuple[Any, ...], options: dict[str, Any], told: str
+    frame_result: Identification, names: tuple[Any, ...], options: dict[str, Any], told: str
 ) -> None:
     with pytest.raises(InvalidSettings, match=re.escape(told)):
-        found.plot(*names, **options)
+        frame_result.plot(*names, **options)
 
 
-def test_figures_may_be_a_list(found: Identification) -> None:
-    assert len(found.plot(["response", "waterfall"]).data) == len(
-        found.plot("response", "waterfall").data
+def test_figures_may_be_a_list(frame_result: Identification) -> None:
+    assert len(frame_result.plot(["response", "waterfall"]).data) == len(
+        frame_result.plot("response", "waterfall").data
     )
     with pytest.raises(InvalidSettings, match="no data for the figure 'response'"):
-        replace(found, data=None).plot("response")
+        replace(frame_result, data=None).plot("response")
 
 
-def test_a_result_is_a_mapping_of_names_to_estimates(found: Identification) -> None:
-    names = [estimate.name for estimate in found.parameters]
-    assert len(found) == len(names)
-    assert list(found) == list(found.keys()) == names
-    assert list(found.values()) == list(found.parameters)
-    assert dict(found) == dict(found.items()) == {name: found[name] for name in names}
-    assert found.get("L") is found["L"]
-    assert found.get("M") is None
-    assert found.get("M", found["L"]) is found["L"]
+def test_a_result_is_a_mapping_of_names_to_estimates(frame_result: Identification) -> None:
+    names = [estimate.name for estimate in frame_result.parameters]
+    assert len(frame_result) == len(names)
+    assert list(frame_result) == list(frame_result.keys()) == names
+    assert list(frame_result.values()) == list(frame_result.parameters)
+    assert (
+        dict(frame_result)
+        == dict(frame_result.items())
+        == {name: frame_result[name] for name in names}
+    )
+    assert frame_result.get("L") is frame_result["L"]
+    assert frame_result.get("M") is None
+    assert frame_result.get("M", frame_result["L"]) is frame_result["L"]
     with pytest.raises(UnknownParameter, match=r"there is no parameter 0; the names are K, T, L"):
-        found[0]  # type: ignore[index]
+        frame_result[0]  # type: ignore[index]
     with pytest.raises(UnknownParameter, match="there is no parameter 'l'; known are K, L"):
-        found["l"]
+        frame_result["l"]
 
 
 def test_a_failure_to_write_leaves_the_old_file_whole(
-    found: Identification, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    frame_result: Identification, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "found.json"
-    found.save(path)
+    frame_result.save(path)
     before = path.read_bytes()
 
     def fill_disk(*_: object) -> None:
@@ -598,6 +610,6 @@ def test_a_failure_to_write_leaves_the_old_file_whole(
 
     monkeypatch.setattr(Path, "replace", fill_disk)
     with pytest.raises(UnwritableFile, match=r"found\.json: it cannot be written: No space left"):
-        found.save(path)
+        frame_result.save(path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]

@@ -11,7 +11,7 @@ import pytest
 from sysid import Identification
 from sysid.control.linear_form import IdentifiedModel
 from tests.documents.tutorials import run_cell
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 PAGE = (ROOT / "docs/notebooks.md").read_text(encoding="utf-8")
 SNIPPETS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)

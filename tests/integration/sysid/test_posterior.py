@@ -10,7 +10,7 @@ from sysid.data.derivations import derive_recording
 from sysid.data.records import Record
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
-from tests.needs import DATA
+from tests.support.requirements import DATA
 
 pytestmark = [pytest.mark.data, pytest.mark.slow]
 LABELS = ("length_m", "p_nom_bar", "phase", "file", "repeat")

@@ -8,9 +8,9 @@ from sysid.identification.run import advance_run, begin_run
 from sysid.models.catalogue.load import load_model
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
-from tests.profiles import draw_seeds
-from tests.rates import bound_count
-from tests.searching import COULOMB, noisy, record
+from tests.support.library.search_problems import COULOMB, noisy, record
+from tests.support.profiles import draw_seeds
+from tests.support.random_bounds import bound_count
 
 
 def misses_the_optimum(seed: int) -> bool:

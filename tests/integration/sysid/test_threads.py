@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from sysid.core.threads import _load_libraries, use_one_thread
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 CONCLUDED = """
 import hashlib
@@ -35,7 +35,7 @@ print(hashlib.sha256(text.encode()).hexdigest())
 """
 
 
-def concluded_with_two_threads() -> str:
+def conclude_with_two_threads() -> str:
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "2"}
     done = subprocess.run(
         [sys.executable, "-c", CONCLUDED],
@@ -53,7 +53,7 @@ def test_a_long_record_gives_the_same_bits_with_one_and_two_threads() -> None:
     told = io.StringIO()
     with use_one_thread(), contextlib.redirect_stdout(told):
         exec(compile(CONCLUDED, "concluded", "exec"), {})
-    assert told.getvalue() == concluded_with_two_threads()
+    assert told.getvalue() == conclude_with_two_threads()
 
 
 def test_the_number_of_threads_comes_back_when_the_last_caller_is_done() -> None:

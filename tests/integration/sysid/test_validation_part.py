@@ -17,7 +17,7 @@ from sysid.models.parse import parse_model
 from sysid.results.identification import Identification
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
-from tests.searching import DUFFING, force
+from tests.support.library.search_problems import DUFFING, force
 from workers.protocol import ProblemSpec
 from workers.tasks import build_pack_problems, prepare_run_records
 
@@ -45,7 +45,7 @@ def free_run(model: str, values: Mapping[str, float], n: int = 600) -> Record:
     return replace(blank, outputs=(replace(blank.outputs[0], values=problem.predict(theta)[0]),))
 
 
-def decay(sd: float = 0.0) -> Record:
+def make_decay(sd: float = 0.0) -> Record:
     times = 0.05 * np.arange(100)
     noise = sd * np.random.default_rng(3).standard_normal((2, 100))
     y, w = 3.0 * np.exp(-0.5 * times) + noise[0], 2.0 * np.exp(-times) + noise[1]
@@ -69,14 +69,16 @@ def test_the_true_model_fits_both_parts_alike(model: str) -> None:
 
 
 def test_an_estimated_initial_state_goes_on_into_the_part_kept() -> None:
-    found = identify(parse_model(DECAY), [decay(), decay()], BRIEF, validation_fraction=FRACTION)
+    found = identify(
+        parse_model(DECAY), [make_decay(), make_decay()], BRIEF, validation_fraction=FRACTION
+    )
     for experiment in found.simulated_validation:
-        for simulated, channel in zip(experiment, decay().outputs, strict=True):
+        for simulated, channel in zip(experiment, make_decay().outputs, strict=True):
             np.testing.assert_allclose(simulated, channel.values[70:], atol=1e-6)
 
 
 def test_the_rms_of_both_parts_are_in_the_same_measure() -> None:
-    record = decay(sd=0.02)
+    record = make_decay(sd=0.02)
     found = identify(parse_model(DECAY), record, BRIEF, validation_fraction=FRACTION)
     split = split_record(record, FRACTION)
     for part, simulated, value in zip(
@@ -95,7 +97,7 @@ def test_the_rms_of_both_parts_are_in_the_same_measure() -> None:
 
 
 def test_other_records_are_judged_with_the_weights_of_the_estimate() -> None:
-    record = decay(sd=0.02)
+    record = make_decay(sd=0.02)
     small = Record((), tuple(replace(c, values=0.1 * c.values) for c in record.outputs))
     found = identify(parse_model(DECAY), record, BRIEF, validation=small)
     weighted = [
@@ -143,19 +145,19 @@ def test_times_to_score_from_are_one_for_each_record() -> None:
 
 def test_the_start_of_another_record_is_estimated_on_its_first_part_only() -> None:
     """What comes later does not move the start: it is there to be predicted."""
-    other = decay()
+    other = make_decay()
     late = tuple(
         replace(one, values=np.where(np.arange(100) < 30, one.values, one.values + 0.5))
         for one in other.outputs
     )
     found = identify(
-        parse_model(DECAY), decay(sd=0.001), BRIEF, validation=replace(other, outputs=late)
+        parse_model(DECAY), make_decay(sd=0.001), BRIEF, validation=replace(other, outputs=late)
     )
     simulated = found.simulated_validation[0][0]
     np.testing.assert_allclose(simulated, other.outputs[0].values, atol=5e-3)
 
 
-def heated(last: float, sign: float = 1.0) -> tuple[Identification, float]:
+def identify_heater(last: float, sign: float = 1.0) -> tuple[Identification, float]:
     """A first-order plant, 0.02 of noise; input and output are scaled in the last 30 %."""
     rng, times = np.random.default_rng(2), 0.1 * np.arange(300)
     u = np.repeat(rng.uniform(-1, 1, 30), 10)
@@ -173,7 +175,7 @@ def heated(last: float, sign: float = 1.0) -> tuple[Identification, float]:
 
 
 def test_a_part_that_hardly_moves_has_an_rms_and_no_fit() -> None:
-    found, spread = heated(0.0)
+    found, spread = identify_heater(0.0)
     assert found.fit_percent.estimation > 95
     assert found.fit_percent.validation is not None
     assert np.isnan(found.fit_percent.validation)
@@ -184,7 +186,7 @@ def test_a_part_that_hardly_moves_has_an_rms_and_no_fit() -> None:
 
 
 def test_a_model_that_predicts_worse_than_the_mean_is_not_validated() -> None:
-    found, spread = heated(1.0, -1.0)
+    found, spread = identify_heater(1.0, -1.0)
     assert found.fit_percent.estimation > 95
     assert found.rms_validation is not None
     assert found.rms_validation > spread
@@ -194,7 +196,7 @@ def test_a_model_that_predicts_worse_than_the_mean_is_not_validated() -> None:
 
 
 def test_a_part_that_moves_less_than_the_rest_keeps_its_fit() -> None:
-    found, _ = heated(0.25)
+    found, _ = identify_heater(0.25)
     assert {one.status for one in found.parameters} == {"identified"}
     assert found.fit_percent.validation is not None
     assert found.fit_percent.validation > 80

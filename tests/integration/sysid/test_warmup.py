@@ -13,7 +13,7 @@ from sysid.models.catalogue.load import load_model
 from sysid.search.least_squares import _run_steps
 from sysid.simulation.evaluator import evaluate_population, predict_population
 from sysid.simulation.scaling import to_unit
-from tests.searching import noisy, record
+from tests.support.library.search_problems import noisy, record
 
 COMPILED = (_run_epochs, _run_steps, evaluate_population, predict_population, to_unit)
 

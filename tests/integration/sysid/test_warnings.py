@@ -45,72 +45,74 @@ SECOND = {
 }
 
 
-def steps(seed: int = 0) -> FloatArray:
+def make_steps(seed: int = 0) -> FloatArray:
     return np.repeat(np.random.default_rng(seed).standard_normal(N // 20), 20)
 
 
-def record(u: FloatArray, y: FloatArray) -> Record:
+def make_record(u: FloatArray, y: FloatArray) -> Record:
     times = STEP * np.arange(N)
     return Record((Channel("u", times, u, "1", hold="zero"),), (Channel("y", times, y, "1"),))
 
 
-def response(model: Model, u: FloatArray, sd: float = 0.01, **values: float) -> FloatArray:
+def compute_response(model: Model, u: FloatArray, sd: float = 0.01, **values: float) -> FloatArray:
     times = STEP * np.arange(N)
     inputs = (Channel("u", times, u, "1", hold="zero"),)
     found = simulate(model, inputs, values, times=times).channel("y").values
     return found + sd * np.random.default_rng(1).standard_normal(N)
 
 
-def told(found: Identification, words: str) -> bool:
+def is_warned(found: Identification, words: str) -> bool:
     return any(words in warning for warning in found.warnings)
 
 
 def test_a_true_model_with_white_noise_has_no_warning() -> None:
     model = parse_model({**FIRST, "solver": {"substeps": 4}})
-    y = response(model, steps(), K=1.5, T=0.3, L=0.2, y0=0.3)
-    assert identify(model, record(steps(), y), QUICK).warnings == ()
+    y = compute_response(model, make_steps(), K=1.5, T=0.3, L=0.2, y0=0.3)
+    assert identify(model, make_record(make_steps(), y), QUICK).warnings == ()
 
 
 def test_a_model_of_too_low_an_order_is_told_that_its_lag_depends_on_it() -> None:
-    y = response(parse_model(SECOND), steps(), L=0.1)
-    found = identify(parse_model(FIRST), record(steps(), y), QUICK)
-    assert told(found, "The estimate of L depends on the order of the model")
-    assert told(found, "standard errors allow for the colour of the residuals")
+    y = compute_response(parse_model(SECOND), make_steps(), L=0.1)
+    found = identify(parse_model(FIRST), make_record(make_steps(), y), QUICK)
+    assert is_warned(found, "The estimate of L depends on the order of the model")
+    assert is_warned(found, "standard errors allow for the colour of the residuals")
 
 
 def test_a_true_model_that_misses_in_another_range_is_not_said_to_lack_dynamics() -> None:
     # A twentieth of the input tells K to a few hundredths: enough to be seen with all of it.
     model, truth = parse_model(FIRST), {"K": 1.5, "T": 0.3, "L": 0.2, "y0": 0.3}
-    small, large = 0.05 * steps(), steps(1)
-    kept = record(large, response(model, large, **truth))
+    small, large = 0.05 * make_steps(), make_steps(1)
+    kept = make_record(large, compute_response(model, large, **truth))
     found = identify(
-        model, record(small, response(model, small, **truth)), QUICK, validation=[kept]
+        model, make_record(small, compute_response(model, small, **truth)), QUICK, validation=[kept]
     )
     assert found.residual_tests is not None
     assert found.residual_tests.data == "validation"
-    assert told(found, "consistent with white noise on the estimation data, but not on the")
-    assert not told(found, "standard errors are too small")
-    poor = response(parse_model(SECOND), steps(), L=0.1)
-    lacking = identify(model, record(steps(), poor), QUICK, validation=[record(steps(), poor)])
-    assert told(lacking, "not white (on the validation data): dynamics are missing from")
+    assert is_warned(found, "consistent with white noise on the estimation data, but not on the")
+    assert not is_warned(found, "standard errors are too small")
+    poor = compute_response(parse_model(SECOND), make_steps(), L=0.1)
+    lacking = identify(
+        model, make_record(make_steps(), poor), QUICK, validation=[make_record(make_steps(), poor)]
+    )
+    assert is_warned(lacking, "not white (on the validation data): dynamics are missing from")
 
 
 def test_an_estimate_that_may_as_well_be_zero_is_told() -> None:
     model = parse_model(FIRST)
-    y = response(model, steps(), sd=0.05, K=1.5, T=0.3, L=0.2, y0=0.0)
-    found = identify(model, record(steps(), y), QUICK)
+    y = compute_response(model, make_steps(), sd=0.05, K=1.5, T=0.3, L=0.2, y0=0.0)
+    found = identify(model, make_record(make_steps(), y), QUICK)
     vague = {e.name for e in found.parameters if e.stderr and e.stderr >= abs(e.value)}
     for estimate in found.parameters:
         expected = estimate.name in vague
-        assert told(found, f"the standard error of {estimate.name},") is expected
+        assert is_warned(found, f"the standard error of {estimate.name},") is expected
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0])
 def test_an_input_that_does_not_excite_names_what_it_leaves_open(level: float) -> None:
     u = np.full(N, level)
     model = parse_model(FIRST)
-    y = response(model, u, K=1.5, T=0.3, L=0.0, y0=0.2)
-    found = identify(model, record(u, y), QUICK)
+    y = compute_response(model, u, K=1.5, T=0.3, L=0.0, y0=0.2)
+    found = identify(model, make_record(u, y), QUICK)
     open_ = {e.name for e in found.parameters if e.stderr is None}
     assert open_
     (text,) = (w for w in found.warnings if "excites nothing" in w)
@@ -122,7 +124,7 @@ def test_an_input_that_does_not_excite_names_what_it_leaves_open(level: float) -
 def test_where_nothing_has_an_effect_the_run_fails_and_says_so() -> None:
     model = parse_model(SECOND)
     with pytest.raises(NothingIdentifiable, match="none of L has an effect on the output"):
-        identify(model, record(np.zeros(N), np.sin(np.arange(N))), QUICK)
+        identify(model, make_record(np.zeros(N), np.sin(np.arange(N))), QUICK)
 
 
 @pytest.mark.parametrize(("substeps", "too_long"), [(1, True), (8, False)])
@@ -133,12 +135,12 @@ def test_an_estimate_that_the_integration_step_has_made_is_replaced_and_told(
     tube = load_model("tube")
     exact, coarse = (replace(tube, solver=replace(tube.solver, substeps=n)) for n in (16, substeps))
     times = 0.01 * np.arange(600)
-    inlet = Channel("u", times, np.interp(times, 0.3 * np.arange(21), steps()[:21]))
+    inlet = Channel("u", times, np.interp(times, 0.3 * np.arange(21), make_steps()[:21]))
     truth = {"K": 1.0, "T": 0.0033, "L": 0.024, "y(0)": float(inlet.values[0])}
     outlet = simulate(exact, [inlet], truth, times=times).channel("y")
     noisy = replace(outlet, values=outlet.values + np.random.default_rng(1).normal(0, 1e-3, 600))
     found = identify(coarse, Record((inlet,), (noisy,)))
-    assert told(found, "the integration step of the model, substeps: 1") == too_long
+    assert is_warned(found, "the integration step of the model, substeps: 1") == too_long
     assert (found.substeps > substeps) == too_long
     for one in found.parameters:
         assert one.stderr is not None
@@ -147,15 +149,19 @@ def test_an_estimate_that_the_integration_step_has_made_is_replaced_and_told(
 
 @pytest.mark.parametrize("level", [0.0, 0.3])  # the mean of a constant 0.3 is not quite 0.3
 def test_a_constant_output_is_told(level: float) -> None:
-    found = identify(parse_model(FIRST), record(steps(), np.full(N, level)), QUICK)
+    found = identify(parse_model(FIRST), make_record(make_steps(), np.full(N, level)), QUICK)
     assert found.verdict.text == "not trustworthy: the output is constant"
-    assert told(found, f"output 'y' is constant ({level:g}) at all {N} samples: it contains no")
+    assert is_warned(
+        found, f"output 'y' is constant ({level:g}) at all {N} samples: it contains no"
+    )
     moving = np.where(np.arange(N) == 7, level + 0.1, level)
-    assert not told(identify(parse_model(FIRST), record(steps(), moving), QUICK), "is constant")
+    assert not is_warned(
+        identify(parse_model(FIRST), make_record(make_steps(), moving), QUICK), "is constant"
+    )
 
 
 def test_what_is_not_identified_tells_the_bound_at_which_it_lies() -> None:
-    found = identify(parse_model(FIRST), record(steps(), np.full(N, 3.0)), QUICK)
+    found = identify(parse_model(FIRST), make_record(make_steps(), np.full(N, 3.0)), QUICK)
     open_ones = [e for e in found.parameters if e.status in ("group", "unidentifiable")]
     at_bound = {e.name for e in open_ones if e.value in (e.lower, e.upper)}
     assert at_bound
@@ -166,11 +172,13 @@ def test_what_is_not_identified_tells_the_bound_at_which_it_lies() -> None:
 
 
 def test_one_step_ahead_without_an_output_that_is_a_state_is_told_to_be_the_free_run() -> None:
-    hidden, y = parse_model(FIRST), response(parse_model(SECOND), steps(), L=0.1)
-    free = identify(hidden, record(steps(), y), QUICK)
-    ahead = identify(hidden, record(steps(), y), QUICK, prediction="one-step")
-    assert told(ahead, "no output (y) is a state by itself")
+    hidden, y = parse_model(FIRST), compute_response(parse_model(SECOND), make_steps(), L=0.1)
+    free = identify(hidden, make_record(make_steps(), y), QUICK)
+    ahead = identify(hidden, make_record(make_steps(), y), QUICK, prediction="one-step")
+    assert is_warned(ahead, "no output (y) is a state by itself")
     assert [one.stderr for one in ahead.parameters] == [one.stderr for one in free.parameters]
     tube, narrow = load_model("tube"), {"L": {"upper": 1.0}}
-    seen = identify(tube, record(steps(), y), QUICK, prediction="one-step", parameters=narrow)
-    assert not told(seen, "is a state by itself")
+    seen = identify(
+        tube, make_record(make_steps(), y), QUICK, prediction="one-step", parameters=narrow
+    )
+    assert not is_warned(seen, "is a state by itself")

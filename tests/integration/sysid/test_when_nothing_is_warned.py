@@ -14,8 +14,8 @@ from sysid.models.catalogue.load import load_model
 from sysid.results.identification import Identification
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
-from tests.searching import DUFFING as TRUTH
-from tests.searching import noisy, record
+from tests.support.library.search_problems import DUFFING as TRUTH
+from tests.support.library.search_problems import noisy, record
 
 DUFFING, FOPDT = load_model("duffing-eq16"), load_model("fopdt")
 TIMES = 0.02 * np.arange(300)
@@ -25,11 +25,11 @@ def driven(name: str, u: FloatArray, y: FloatArray) -> Record:
     return Record((Channel(name, TIMES, u, hold="zero"),), (Channel("y", TIMES, y),))
 
 
-def noise(sd: float = 0.01) -> FloatArray:
+def draw_noise(sd: float = 0.01) -> FloatArray:
     return sd * np.random.default_rng(0).standard_normal(300)
 
 
-def told(found: Identification, words: str) -> bool:
+def is_warned(found: Identification, words: str) -> bool:
     return any(words in warning for warning in found.warnings)
 
 
@@ -41,8 +41,8 @@ def test_the_papers_examples_are_warned_of_nothing(model: str, seed: int) -> Non
 
 def test_residuals_of_an_estimate_that_is_no_optimum_say_nothing_of_the_model() -> None:
     found = identify(DUFFING, record(noisy()), GeneticAlgorithm(method="simple"))
-    assert told(found, "not a local optimum")
-    assert not told(found, "not white")
+    assert is_warned(found, "not a local optimum")
+    assert not is_warned(found, "not white")
 
 
 def test_residuals_of_the_solver_are_no_doubt_about_the_minimum() -> None:
@@ -56,21 +56,22 @@ def test_residuals_of_the_solver_are_no_doubt_about_the_minimum() -> None:
     found = identify(FOPDT, Record((Channel("u", t, command),), (Channel("y", t, y),)))
     values = {estimate.name: estimate.value for estimate in found.parameters}
     assert values["L"] == pytest.approx(lag, abs=1e-4)
-    assert not told(found, "not a local optimum")
-    assert not told(found, "white")
+    assert not is_warned(found, "not a local optimum")
+    assert not is_warned(found, "white")
 
 
 def test_an_input_that_is_constant_in_one_record_only_is_not_told() -> None:
     at_rest = Record(
-        (Channel("q", TIMES, 0.0 * TIMES, "N", hold="zero"),), (Channel("y", TIMES, noise(), "m"),)
+        (Channel("q", TIMES, 0.0 * TIMES, "N", hold="zero"),),
+        (Channel("y", TIMES, draw_noise(), "m"),),
     )
-    assert not told(identify(DUFFING, [record(noisy()), at_rest]), "excites nothing")
+    assert not is_warned(identify(DUFFING, [record(noisy()), at_rest]), "excites nothing")
 
 
 def test_of_parameters_without_a_standard_error_only_their_groups_are_told() -> None:
-    found = identify(FOPDT, driven("u", 0.0 * TIMES + 2.0, 3.0 + noise()))
-    assert told(found, "input 'u' is constant, so it excites nothing")
-    assert not told(found, "correlation")
+    found = identify(FOPDT, driven("u", 0.0 * TIMES + 2.0, 3.0 + draw_noise()))
+    assert is_warned(found, "input 'u' is constant, so it excites nothing")
+    assert not is_warned(found, "correlation")
 
 
 @pytest.mark.parametrize(("sd", "vague"), [(0.01, False), (2.0, True)])
@@ -79,10 +80,10 @@ def test_only_a_quantity_of_one_sign_is_told_to_be_no_more_than_its_error(
 ) -> None:
     fixed = {name: {"fixed": TRUTH[name]} for name in ("a", "b", "L")}
     positive = identify(DUFFING, record(noisy(sd=sd, seed=3)), parameters=fixed)
-    assert told(positive, "the standard error of c") is vague
+    assert is_warned(positive, "the standard error of c") is vague
     either = fixed | {"c": {"lower": -2.0, "upper": 5.0}}
     found = identify(DUFFING, record(noisy(sd=sd, seed=3)), parameters=either)
-    assert not told(found, "the standard error of c")
+    assert not is_warned(found, "the standard error of c")
 
 
 def test_a_lag_that_may_as_well_be_zero_is_not_separable_from_what_it_is_on_a_ridge_with() -> None:
@@ -90,9 +91,9 @@ def test_a_lag_that_may_as_well_be_zero_is_not_separable_from_what_it_is_on_a_ri
     known = {"K": {"fixed": 1.0}, "y0": {"fixed": 0.0}, "x(0)": {"fixed": 0.0}}
     sought = known | {"T": {"lower": 0.01, "upper": 2.0}, "L": {"lower": 0.0, "upper": 0.4}}
     problem = Problem.build(FOPDT, [driven("u", TIMES / 6, 0.0 * TIMES)], parameters=sought)
-    y = problem.predict(np.array([[0.2, 0.05]]))[0] + noise(0.02)
+    y = problem.predict(np.array([[0.2, 0.05]]))[0] + draw_noise(0.02)
     found = identify(FOPDT, driven("u", TIMES / 6, y), parameters=sought)
-    assert told(found, "T and L not separable")
+    assert is_warned(found, "T and L not separable")
     # Coloured residuals may turn the ellipsoid; what one sensitivity makes up for in another stays.
     problem = Problem.build(FOPDT, [driven("u", TIMES / 6, y)], parameters=sought)
     theta = np.array([found[name].value for name in problem.free_names])

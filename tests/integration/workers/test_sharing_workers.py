@@ -14,10 +14,10 @@ from service.queue.admission import Admission
 from service.queue.leases import Claim
 from service.storage.objects import open_store
 from service.storage.sessions import Database
-from tests.dispatching import Place
-from tests.inline_executor import InlineExecutor
-from tests.limits import LIMIT_SECONDS
-from tests.runs import ListedRuns, Notebook, bits, carry_out, spec
+from tests.support.cluster.dispatch_place import Place
+from tests.support.cluster.inline_executor import InlineExecutor
+from tests.support.cluster.small_runs import ListedRuns, Notebook, bits, carry_out, spec
+from tests.support.limits import LIMIT_SECONDS
 from workers import packing
 from workers.protocol import EvolveIsland, Pack, QueuedRun
 from workers.scheduler import Scheduler
@@ -120,7 +120,7 @@ def test_the_islands_of_one_long_run_keep_both_workers_busy_with_the_same_bits(
     most = 0
     submit, fetch = ray_executor.submit_pack, ray_executor.fetch_results
 
-    def counted(pack: Pack) -> Any:
+    def count_and_submit(pack: Pack) -> Any:
         nonlocal most
         handle = submit(pack)
         if isinstance(pack.items[0], EvolveIsland):
@@ -128,12 +128,12 @@ def test_the_islands_of_one_long_run_keep_both_workers_busy_with_the_same_bits(
             most = max(most, len(flying))
         return handle
 
-    def fetched(handle) -> Any:
+    def count_and_fetch(handle) -> Any:
         flying.discard(handle)
         return fetch(handle)
 
-    monkeypatch.setattr(ray_executor, "submit_pack", counted)
-    monkeypatch.setattr(ray_executor, "fetch_results", fetched)
+    monkeypatch.setattr(ray_executor, "submit_pack", count_and_submit)
+    monkeypatch.setattr(ray_executor, "fetch_results", count_and_fetch)
     spread = carry_out(ray_executor, {"r": one})
     assert most == ray_executor.slots
     assert bits(spread.results["r"][0]) == bits(plain.results["r"][0])

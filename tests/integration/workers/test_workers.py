@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.inline_executor import InlineExecutor
-from tests.limits import LIMIT_SECONDS
-from tests.runs import ListedRuns, Notebook, bits, carry_out, spec
+from tests.support.cluster.inline_executor import InlineExecutor
+from tests.support.cluster.small_runs import ListedRuns, Notebook, bits, carry_out, spec
+from tests.support.limits import LIMIT_SECONDS
 from workers import packing
 from workers import ray_executor as module
 from workers.errors import ClusterLost

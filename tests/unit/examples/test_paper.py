@@ -22,12 +22,15 @@ from sysid.models.catalogue.load import copy_catalogue_document
 from sysid.models.parse import parse_model
 
 
-def point(generation: int, rms: float, value: float) -> dict[str, object]:
+def make_point(generation: int, rms: float, value: float) -> dict[str, object]:
     return {"generation": generation, "rms": rms, "parameters": [value]}
 
 
 def test_the_champion_of_an_archipelago_is_the_best_of_its_islands_so_far() -> None:
-    islands = [[point(0, 3.0, 1), point(4, 1.0, 2)], [point(0, 2.0, 3), point(2, 2.5, 4)]]
+    islands = [
+        [make_point(0, 3.0, 1), make_point(4, 1.0, 2)],
+        [make_point(0, 2.0, 3), make_point(2, 2.5, 4)],
+    ]
     found = champion_history({"names": ["a"], "islands": islands})
     assert [(one.generation, one.rms, one.parameters["a"]) for one in found] == [
         (0, 3.0, 1),

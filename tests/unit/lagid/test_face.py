@@ -11,7 +11,7 @@ import pytest
 
 import lagid
 import sysid
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 
 def run_python(code: str, *folders: Path, name: str = "-c") -> "subprocess.CompletedProcess[str]":

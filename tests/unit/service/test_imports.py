@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 # Statements of one process, in order. What is loaded stays loaded, so a later entry may only be
 # forbidden what no earlier one needs.
@@ -61,7 +61,7 @@ print(json.dumps(loaded))
 
 
 @pytest.fixture(scope="module")
-def loaded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
+def loaded_modules(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     """Names of all modules that are loaded after each entry."""
     data = tmp_path_factory.mktemp("imports") / "d.csv"
     data.write_text("t,u,y\n" + "".join(f"{0.1 * k},{k % 3},{k}\n" for k in range(20)))
@@ -111,7 +111,7 @@ def run_statements(statements: dict[str, str], data: Path) -> dict[str, list[str
     ],
 )
 def test_an_entry_loads_no_library_that_it_does_not_need(
-    loaded: dict[str, set[str]], entry: str, heavy: set[str]
+    loaded_modules: dict[str, set[str]], entry: str, heavy: set[str]
 ) -> None:
-    assert "service" in loaded[entry]
-    assert heavy & loaded[entry] == set()
+    assert "service" in loaded_modules[entry]
+    assert heavy & loaded_modules[entry] == set()

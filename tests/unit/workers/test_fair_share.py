@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.simulated_executor import Theatre
+from tests.support.cluster.simulated_executor import Theatre
 from workers.fair_share import (
     HEADSTART_SECONDS,
     MAX_ABSENT_PROJECTS,

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import pytest
 
-from tests.runs import RECORDS, Notebook, encode_runs, spec
+from tests.support.cluster.small_runs import RECORDS, Notebook, encode_runs, spec
 from tests.unit.workers.test_scheduler import ScriptedExecutor, jobs
 from workers.packing import PACK_SECONDS
 from workers.protocol import (
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("time_to_read")
 
 
 @pytest.fixture(scope="module")
-def concluded() -> RunConclusion:
+def concluded_run() -> RunConclusion:
     item = AdvanceRun("any", spec(generations=2, refine=False), None, 60.0)
     (done,) = process_pack((item,), ("short",), RECORDS["short"])
     assert isinstance(done.outcome, RunConclusion)
@@ -34,17 +34,17 @@ def concluded() -> RunConclusion:
 
 
 @pytest.fixture(scope="module")
-def advanced() -> RunProgress:
+def advanced_run() -> RunProgress:
     (done,) = process_pack((AdvanceRun("any", spec(), None, 0.0),), ("short",), RECORDS["short"])
     assert isinstance(done.outcome, RunProgress)
     return done.outcome
 
 
-def told(notebook: Notebook) -> list[str]:
+def list_recorded(notebook: Notebook) -> list[str]:
     return [run for run, results in notebook.results.items() for _ in results]
 
 
-def steps(feeder: Scheduler[str], most: int = 1000) -> Iterator[tuple[str, ...]]:
+def make_steps(feeder: Scheduler[str], most: int = 1000) -> Iterator[tuple[str, ...]]:
     for _ in range(most):
         if not feeder._jobs:
             return
@@ -52,25 +52,25 @@ def steps(feeder: Scheduler[str], most: int = 1000) -> Iterator[tuple[str, ...]]
     raise AssertionError("the jobs did not end")
 
 
-def test_every_result_is_told_once_before_the_job_ends(concluded: RunConclusion) -> None:
-    feeder = Scheduler(ScriptedExecutor(lambda item: ItemResult(item.run, concluded, 0.01)))
+def test_every_result_is_told_once_before_the_job_ends(concluded_run: RunConclusion) -> None:
+    feeder = Scheduler(ScriptedExecutor(lambda item: ItemResult(item.run, concluded_run, 0.01)))
     notebook = jobs(feeder, a=60)["a"]
-    for ended in steps(feeder):
-        assert bool(ended) == (len(told(notebook)) == 60)
-    assert sorted(told(notebook)) == sorted(f"a{number}" for number in range(60))
+    for ended in make_steps(feeder):
+        assert bool(ended) == (len(list_recorded(notebook)) == 60)
+    assert sorted(list_recorded(notebook)) == sorted(f"a{number}" for number in range(60))
 
 
 def test_a_slice_of_a_single_run_goes_on_while_results_of_a_sweep_are_told(
-    concluded: RunConclusion, advanced: RunProgress
+    concluded_run: RunConclusion, advanced_run: RunProgress
 ) -> None:
     slices = 0
 
     def answer(item: WorkItem) -> ItemResult:
         nonlocal slices
         if not item.run.startswith("single"):
-            return ItemResult(item.run, concluded, 0.01)
+            return ItemResult(item.run, concluded_run, 0.01)
         slices += 1
-        outcome = concluded if slices == 8 else advanced
+        outcome = concluded_run if slices == 8 else advanced_run
         return ItemResult(item.run, outcome, PACK_SECONDS)
 
     feeder = Scheduler(ScriptedExecutor(answer))
@@ -78,42 +78,42 @@ def test_a_slice_of_a_single_run_goes_on_while_results_of_a_sweep_are_told(
     while len(notebook.begun) < 100:  # by then its packs have many runs each
         feeder.run_step(0.0)
     single = jobs(feeder, single=1)["single"]
-    before = len(told(notebook))
+    before = len(list_recorded(notebook))
     for _ in range(8 + 2):  # a slice a step, and a step for its way in and out
         feeder.run_step(0.0)
-    assert told(single) == ["single0"]
-    assert len(told(notebook)) > before
+    assert list_recorded(single) == ["single0"]
+    assert len(list_recorded(notebook)) > before
 
 
 def test_a_job_that_is_stopped_alone_still_tells_what_has_come_back(
-    concluded: RunConclusion,
+    concluded_run: RunConclusion,
 ) -> None:
-    executor = ScriptedExecutor(lambda item: ItemResult(item.run, concluded, 0.01))
+    executor = ScriptedExecutor(lambda item: ItemResult(item.run, concluded_run, 0.01))
     feeder = Scheduler(executor)
     notebook = jobs(feeder, a=400)["a"]
     for _ in range(20):
         feeder.run_step(0.0)
     come = len(notebook.begun) - sum(len(pack) for pack in executor.packs.values())
     feeder.stop_jobs(["a"])
-    for _ in steps(feeder):
+    for _ in make_steps(feeder):
         pass
-    assert len(told(notebook)) == come
+    assert len(list_recorded(notebook)) == come
 
 
-def test_a_run_that_cannot_be_encoded_fails_and_no_other(concluded: RunConclusion) -> None:
+def test_a_run_that_cannot_be_encoded_fails_and_no_other(concluded_run: RunConclusion) -> None:
     def encode(complete: Sequence[CompleteRun], records: Mapping[str, Records]) -> bytes:
         if any(run.run == "bad" for run in complete):
             raise ValueError("as told")
         return encode_runs(complete, records)
 
     items = [AdvanceRun(run, spec(), None, 1.0, spent=2.0) for run in ("a", "bad", "b")]
-    results = [ItemResult(item.run, concluded, 0.5) for item in items]
+    results = [ItemResult(item.run, concluded_run, 0.5) for item in items]
     pack = encode_pack(encode, items, results, {})
     assert [type(one.outcome) for one in pack.results] == [RunEnd, RunFailure, RunEnd]
     failure = pack.results[1].outcome
     assert isinstance(failure, RunFailure)
     assert failure.reason == "internal error: its result cannot be stored: ValueError: as told"
-    assert failure.evaluations == concluded.identification.evaluations
+    assert failure.evaluations == concluded_run.identification.evaluations
     assert pack.encoded is not None
     assert [run for run, _ in pickle.loads(pack.encoded)] == ["a", "b"]
     alone = encode_pack(encode, items[1:2], results[1:2], {})
@@ -121,7 +121,7 @@ def test_a_run_that_cannot_be_encoded_fails_and_no_other(concluded: RunConclusio
 
 
 def test_an_encoder_is_told_the_whole_time_of_a_run_and_what_was_reported(
-    concluded: RunConclusion, advanced: RunProgress
+    concluded_run: RunConclusion, advanced_run: RunProgress
 ) -> None:
     seen: list[CompleteRun] = []
 
@@ -129,13 +129,13 @@ def test_an_encoder_is_told_the_whole_time_of_a_run_and_what_was_reported(
         seen.extend(complete)
         return b""
 
-    state = advanced.state
+    state = advanced_run.state
     items = [
         AdvanceRun("new", spec(), None, 1.0),
         AdvanceRun("saved", spec(), state, 1.0, spent=0.0),
         AdvanceRun("sliced", spec(), state, 1.0, spent=2.0, is_reported=True),
     ]
-    encode_pack(encode, items, [ItemResult(item.run, concluded, 0.5) for item in items], {})
+    encode_pack(encode, items, [ItemResult(item.run, concluded_run, 0.5) for item in items], {})
     assert [(run.run, run.seconds, run.reported) for run in seen] == [
         ("new", 0.5, None),
         ("saved", 0.5, None),

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from sysid.data.noise import Noise
-from tests.runs import spec
+from tests.support.cluster.small_runs import spec
 from workers.protocol import AdvanceRun
 
 

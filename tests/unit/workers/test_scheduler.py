@@ -7,8 +7,16 @@ import pytest
 
 from sysid.core.errors import InvalidSettings
 from sysid.identification.run import begin_run
-from tests.inline_executor import InlineExecutor
-from tests.runs import RECORDS, ListedRuns, Notebook, bits, carry_out, encode_runs, spec
+from tests.support.cluster.inline_executor import InlineExecutor
+from tests.support.cluster.small_runs import (
+    RECORDS,
+    ListedRuns,
+    Notebook,
+    bits,
+    carry_out,
+    encode_runs,
+    spec,
+)
 from workers import packing, scheduler, tasks
 from workers.errors import PackCancelled, PackFailed, PackLost, RecordsUnavailable, WorkerDied
 from workers.job_queue import JobQueue

@@ -22,10 +22,10 @@ from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.noise_models import generalised_least_squares
 from sysid.simulation.problem import Problem
-from tests.compiling import compile_here
-from tests.inline_executor import InlineExecutor
-from tests.polynomials import frols, lagged
-from tests.runs import RECORDS, bits, carry_out, spec
+from tests.support.cluster.inline_executor import InlineExecutor
+from tests.support.cluster.small_runs import RECORDS, bits, carry_out, spec
+from tests.support.library.local_compilation import compile_here
+from tests.support.library.polynomials import build_lagged, frols
 from workers.protocol import AdvanceRun, ProblemSpec, RunConclusion, RunFailure, RunSpec
 
 FAULTY_SEED = 13
@@ -97,7 +97,7 @@ def test_a_run_whose_model_needs_too_long_to_compile_fails_alone_with_the_limit(
 
 
 def test_a_run_that_selects_terms_gives_the_bits_of_the_library_call() -> None:
-    asked = lagged(frols(4))
+    asked = build_lagged(frols(4))
     problem = ProblemSpec(model=asked, records="short", settings=FitSettings(skip=3))
     settings = GeneticAlgorithm(generations=10)
     (result,) = carry_out(InlineExecutor(), {"r": RunSpec(problem, settings, 4)}).results["r"]
@@ -182,7 +182,7 @@ def result_of(run: RunSpec) -> tuple[object, ...]:
 
 
 def test_terms_are_selected_anew_for_other_noise() -> None:
-    quiet = ProblemSpec(model=lagged(frols(4)), records="short", settings=FitSettings(skip=3))
+    quiet = ProblemSpec(model=build_lagged(frols(4)), records="short", settings=FitSettings(skip=3))
     noisy = replace(quiet, noise=Noise(2.0, 1))
     alone = workers.tasks.build_pack_problems(noisy, RECORDS)[0]
     beside = workers.tasks.build_pack_problems(
@@ -226,11 +226,11 @@ def test_a_cancel_between_the_parts_of_a_conclusion_ends_the_pack_and_harms_no_l
     pack = [AdvanceRun("r", replace(run, problem=problem), None, 100.0)]
     (whole,) = workers.tasks.process_pack(pack, ["drifting"], records)
 
-    def cancelled(*arguments: object, **_: object) -> None:
+    def interrupt_process(*arguments: object, **_: object) -> None:
         os.kill(os.getpid(), signal.SIGINT)  # as Ray does to a worker
 
     with monkeypatch.context() as patched:
-        patched.setattr(module, part, cancelled)
+        patched.setattr(module, part, interrupt_process)
         with pytest.raises(KeyboardInterrupt):
             workers.tasks.process_pack(pack, ["drifting"], records)
     (again,) = workers.tasks.process_pack(pack, ["drifting"], records)

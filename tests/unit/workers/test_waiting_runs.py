@@ -6,7 +6,7 @@ import pytest
 
 from service.dispatch.warm_starts import OpenChains
 from service.jobs.warm_start_order import ChainLayout
-from tests.runs import RECORDS, Notebook, spec
+from tests.support.cluster.small_runs import RECORDS, Notebook, spec
 from tests.unit.workers.test_scheduler import ScriptedExecutor, fails, finish, jobs
 from workers.protocol import JobEntry, QueuedRun, Records, RunNotReady
 from workers.scheduler import Scheduler

@@ -12,7 +12,7 @@ from service.api import content
 from service.api.content import content_response, receive_upload
 from service.core.errors import StaleVersion, StalledRequest, UnsatisfiableRange
 from service.core.settings import Settings
-from tests.rest import awaited
+from tests.support.service.web_app import await_in_thread
 
 WHOLE = {"first": b"0123456789", "second": b"abcdefgh"}
 
@@ -33,17 +33,17 @@ def answer(file: str, method: str = "GET", **headers: str) -> Any:
     return content_response(request, TwoObjects(), file, "run.mcap")
 
 
-def body(response: Any) -> bytes:
+def make_body(response: Any) -> bytes:
     async def read() -> bytes:
         return b"".join([piece async for piece in response.body_iterator])
 
-    return awaited(read)
+    return await_in_thread(read)
 
 
 @pytest.mark.parametrize("file", WHOLE)
 def test_a_file_comes_whole_with_its_length(file: str) -> None:
     found = answer(file)
-    assert (found.status_code, body(found)) == (200, WHOLE[file])
+    assert (found.status_code, make_body(found)) == (200, WHOLE[file])
     assert found.headers["content-length"] == str(len(WHOLE[file]))
     assert answer(file, "HEAD").headers["content-length"] == str(len(WHOLE[file]))
 
@@ -65,7 +65,7 @@ def test_a_file_comes_whole_with_its_length(file: str) -> None:
 )
 def test_a_range_is_within_the_file(file: str, text: str, part: slice) -> None:
     found, whole = answer(file, range=text), WHOLE[file]
-    assert (found.status_code, body(found)) == (206, whole[part])
+    assert (found.status_code, make_body(found)) == (206, whole[part])
     start, stop, _ = part.indices(len(whole))
     assert found.headers["content-range"] == f"bytes {start}-{stop - 1}/{len(whole)}"
 
@@ -80,7 +80,7 @@ def test_a_range_outside_the_file_is_refused_also_if_the_object_goes_on(text: st
 
 @pytest.mark.parametrize("text", ["bytes=0-1,3-4", "bytes=-", "lines=0-1", "bytes=x-"])
 def test_a_range_that_is_not_understood_gives_the_whole_file(text: str) -> None:
-    assert body(answer("second", range=text)) == WHOLE["second"]
+    assert make_body(answer("second", range=text)) == WHOLE["second"]
 
 
 def test_each_file_has_its_own_version() -> None:
@@ -124,4 +124,4 @@ def test_a_sender_that_stops_loses_its_place(
         [(b"content-type", b"multipart/form-data; boundary=x"), (b"content-length", b"99")],
     ):
         pieces = [b"--x\r\n"]
-        awaited(partial(play, headers))
+        await_in_thread(partial(play, headers))

@@ -92,7 +92,7 @@ def test_where_else_a_field_is_is_told_as_it_would_be_typed() -> None:
     assert told == "--set population: unknown field; there is --set algorithm.population"
 
 
-def refusal(status: int, *entries: dict[str, Any]) -> ProblemError:
+def read_refusal(status: int, *entries: dict[str, Any]) -> ProblemError:
     return ProblemError(status, {"title": "refused", "errors": list(entries)})
 
 
@@ -105,14 +105,15 @@ def test_all_faults_are_one_line_with_columns_and_without_the_servers_words(
         {"pointer": "/truth/inputs/u/expression", "column": 3, "detail": "ends"},
     )
     with pytest.raises(typer.Exit) as ended, report_faults(sweeps.FIELD_ORIGINS):
-        raise refusal(422, *entries)
+        raise read_refusal(422, *entries)
     assert ended.value.exit_code == 1
     line = capsys.readouterr().err
     assert line == "lagid: --sigma: found -1; whole; --input u, column 3: ends\n"
 
 
 @pytest.mark.parametrize(
-    "error", [refusal(409, {"pointer": "/a", "detail": "b"}), refusal(422), refusal(404)]
+    "error",
+    [read_refusal(409, {"pointer": "/a", "detail": "b"}), read_refusal(422), read_refusal(404)],
 )
 def test_what_is_no_fault_of_the_body_goes_on_as_it_is(error: ProblemError) -> None:
     with pytest.raises(ProblemError) as told, report_faults(FieldOrigins()):

@@ -13,7 +13,7 @@ from service.cli import common, demo
 from service.cli.common import Listing, fetch_listing
 from service.cli.main import build_program
 from sysid.identification import warmup
-from tests.commands import check_refusal, run_lagid
+from tests.support.service.commands import check_refusal, run_lagid
 
 PROGRAM: Any = typer.main.get_command(build_program())
 

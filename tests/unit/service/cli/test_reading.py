@@ -10,7 +10,7 @@ import typer
 from service.cli.common import report_faults, upload_origins
 from service.cli.identify import FileOptions, read_input_file
 from service.client.calls import build_upload, raise_for_problem
-from tests.recorded_files import TIMES, join_rows, write_parquet
+from tests.support.files.experiment_files import TIMES, join_rows, write_parquet
 
 
 def refuse(path: Path, capsys: pytest.CaptureFixture[str], *segments: str) -> str:

@@ -21,8 +21,8 @@ from service.client.async_client import AsyncClient
 from service.client.calls import ClientError, WaitTimeout, choose_key
 from service.client.client import Client
 from service.client.rows import Rows
-from tests.repository import ROOT
-from tests.rest import awaited
+from tests.support.checkout import ROOT
+from tests.support.service.web_app import await_in_thread
 
 # Values of the arguments that a method may need, by the beginning of their annotation.
 ARGUMENTS = {"Mapping": {}, "list": [], "str | pathlib.Path": b"t,u\n0,1\n1,2\n", "str": "x"}
@@ -93,7 +93,7 @@ def ask_all_awaited() -> dict[str, tuple[list[Sent], Any]]:
                 exchanges[name] = (listener.take(), answer)
         return exchanges
 
-    exchanges: dict[str, tuple[list[Sent], Any]] = awaited(work)
+    exchanges: dict[str, tuple[list[Sent], Any]] = await_in_thread(work)
     return exchanges
 
 
@@ -188,7 +188,7 @@ def test_waiting_ends_in_time_and_the_error_has_the_last_state() -> None:
             await client.wait("job_1", timeout=0.01, poll=0.001)
 
     with pytest.raises(WaitTimeout):
-        awaited(work)
+        await_in_thread(work)
 
 
 def test_a_bar_on_stderr_shows_the_runs_of_a_job(capsys: pytest.CaptureFixture[str]) -> None:
@@ -284,7 +284,7 @@ def test_a_client_that_waits_works_where_a_loop_runs_as_in_a_notebook() -> None:
             assert pieces.is_closed
             return [first, client.job("x")["id"], *client.iterate_jobs()]
 
-    assert awaited(work) == [b"0123456789", "x"]
+    assert await_in_thread(work) == [b"0123456789", "x"]
 
 
 def give_pages(request: httpx.Request) -> httpx.Response:
@@ -305,7 +305,7 @@ def test_an_iterator_that_was_begun_in_a_loop_goes_on_outside_it() -> None:
         async def begin() -> list[Any]:
             return [next(jobs), next(pieces)]
 
-        assert awaited(begin) == [0, b"0123456789"]
+        assert await_in_thread(begin) == [0, b"0123456789"]
         assert list(jobs) == [1, 2, 3, 4, 5, 6, 7]
         assert b"".join(pieces) == b"0123456789" * 4
 
@@ -356,7 +356,7 @@ def test_a_stream_of_the_synchronous_client_that_is_left_leaves_nothing_in_a_loo
         await asyncio.sleep(0)
         assert asyncio.all_tasks() == {asyncio.current_task()}
 
-    awaited(work)
+    await_in_thread(work)
 
 
 def test_a_stream_of_the_asynchronous_client_that_is_left_leaves_no_task() -> None:
@@ -372,7 +372,7 @@ def test_a_stream_of_the_asynchronous_client_that_is_left_leaves_no_task() -> No
                     await asyncio.sleep(0)
                 assert asyncio.all_tasks() == {asyncio.current_task()}
 
-    awaited(work)
+    await_in_thread(work)
 
 
 def test_a_cancelled_download_ends_its_stream() -> None:
@@ -390,7 +390,7 @@ def test_a_cancelled_download_ends_its_stream() -> None:
                 await asyncio.wait_for(anext(pieces), 0.01)
             assert EndlessStream.open == 0
 
-    awaited(work)
+    await_in_thread(work)
 
 
 def test_an_error_at_the_caller_ends_the_stream() -> None:

@@ -14,13 +14,13 @@ from service.client import client as synchronous
 from service.client.async_client import AsyncClient
 from service.client.calls import ProblemError, ServerUnreachable
 from service.client.client import Client
-from tests.rest import awaited
+from tests.support.service.web_app import await_in_thread
 
 JOB = {"id": "job_1", "state": "queued"}
 AWAY = httpx.codes.SERVICE_UNAVAILABLE
 
 
-class Server:
+class ScriptedServer:
     """Answers with these statuses, one after the other, and keeps what it was asked."""
 
     def __init__(self, *statuses: int, headers: dict[str, str] | None = None) -> None:
@@ -50,18 +50,18 @@ def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return pauses
 
 
-def synchronously(server: Server, name: str, *given: Any, **settings: Any) -> Any:
+def synchronously(server: ScriptedServer, name: str, *given: Any, **settings: Any) -> Any:
     with Client("http://here", transport=httpx.MockTransport(server), **settings) as client:
         return getattr(client, name)(*given)
 
 
-def asynchronously(server: Server, name: str, *given: Any, **settings: Any) -> Any:
+def asynchronously(server: ScriptedServer, name: str, *given: Any, **settings: Any) -> Any:
     async def work() -> Any:
         transport = httpx.MockTransport(server)
         async with AsyncClient("http://here", transport=transport, **settings) as client:
             return await getattr(client, name)(*given)
 
-    return awaited(work)
+    return await_in_thread(work)
 
 
 Asked = Callable[..., Any]
@@ -82,7 +82,7 @@ both = pytest.mark.parametrize("asked", [synchronously, asynchronously])
 def test_a_call_that_may_be_sent_twice_is_sent_until_it_is_served(
     slept: list[float], asked: Asked, name: str, given: Sequence[Any]
 ) -> None:
-    server = Server(AWAY, AWAY, 200)
+    server = ScriptedServer(AWAY, AWAY, 200)
     assert asked(server, name, *given) == JOB
     assert slept == [0.5, 1.0]
     assert len({request.headers.get("Idempotency-Key") for request in server.asked}) == 1
@@ -96,7 +96,7 @@ def test_a_call_that_may_be_sent_twice_is_sent_until_it_is_served(
 def test_a_call_that_might_be_carried_out_twice_is_sent_once(
     slept: list[float], asked: Asked, name: str, given: Sequence[Any]
 ) -> None:
-    server = Server(AWAY, 200)
+    server = ScriptedServer(AWAY, 200)
     with pytest.raises(ProblemError, match="try again"):
         asked(server, name, *given)
     assert (len(server.asked), slept) == (1, [])
@@ -104,7 +104,7 @@ def test_a_call_that_might_be_carried_out_twice_is_sent_once(
 
 @both
 def test_a_job_has_a_key_of_its_own_if_none_is_given(slept: list[float], asked: Asked) -> None:
-    server = Server(200, 200)
+    server = ScriptedServer(200, 200)
     asked(server, "submit", {})
     asked(server, "submit", {})
     keys = {request.headers["Idempotency-Key"] for request in server.asked}
@@ -117,7 +117,7 @@ def test_a_job_has_a_key_of_its_own_if_none_is_given(slept: list[float], asked: 
 def test_in_the_end_the_refusal_is_raised(
     slept: list[float], asked: Asked, retries: int, pauses: list[float]
 ) -> None:
-    server = Server(*[AWAY] * 9)
+    server = ScriptedServer(*[AWAY] * 9)
     with pytest.raises(ProblemError) as refused:
         asked(server, "job", "job_1", retries=retries)
     assert refused.value.status == AWAY
@@ -137,7 +137,7 @@ def test_in_the_end_the_refusal_is_raised(
     ],
 )
 def test_what_the_server_asks_for_is_waited(slept: list[float], header: str, pause: float) -> None:
-    server = Server(AWAY, 200, headers={"Retry-After": header})
+    server = ScriptedServer(AWAY, 200, headers={"Retry-After": header})
     assert synchronously(server, "job", "job_1") == JOB
     assert slept == [pause]
 
@@ -148,12 +148,12 @@ def test_a_date_is_waited_for(slept: list[float], monkeypatch: pytest.MonkeyPatc
     for ahead, pause in ((20, 20.0), (-60, 0.0)):
         slept.clear()
         until = format_datetime(now + timedelta(seconds=ahead), usegmt=True)
-        synchronously(Server(AWAY, 200, headers={"Retry-After": until}), "job", "job_1")
+        synchronously(ScriptedServer(AWAY, 200, headers={"Retry-After": until}), "job", "job_1")
         assert slept == [pause]
 
 
 def test_nobody_waits_for_a_server_that_is_away_for_long(slept: list[float]) -> None:
-    server = Server(AWAY, 200, headers={"Retry-After": "3600"})
+    server = ScriptedServer(AWAY, 200, headers={"Retry-After": "3600"})
     with pytest.raises(ProblemError):
         synchronously(server, "job", "job_1")
     assert (slept, len(server.asked)) == ([], 1)
@@ -161,7 +161,7 @@ def test_nobody_waits_for_a_server_that_is_away_for_long(slept: list[float]) -> 
 
 @pytest.mark.parametrize("status", [404, 409, 422, 500, 502])
 def test_other_refusals_stand(slept: list[float], status: int) -> None:
-    server = Server(status, 200)
+    server = ScriptedServer(status, 200)
     with pytest.raises(ProblemError):
         synchronously(server, "job", "job_1")
     assert slept == []
@@ -170,7 +170,7 @@ def test_other_refusals_stand(slept: list[float], status: int) -> None:
 def test_events_are_asked_for_again_and_told_from_where_they_broke_off(
     slept: list[float],
 ) -> None:
-    server = Server(AWAY, 200)
+    server = ScriptedServer(AWAY, 200)
 
     def stream(request: httpx.Request) -> httpx.Response:
         answer = server(request)
@@ -187,8 +187,8 @@ def test_events_are_asked_for_again_and_told_from_where_they_broke_off(
         async with AsyncClient("http://here", transport=transport) as client:
             return [event async for event in client.events("job_1")]
 
-    server = Server(AWAY, 200)
-    assert awaited(work) == [event]
+    server = ScriptedServer(AWAY, 200)
+    assert await_in_thread(work) == [event]
 
 
 def test_events_of_a_server_that_is_not_there() -> None:
@@ -200,12 +200,12 @@ def test_events_of_a_server_that_is_not_there() -> None:
 def test_a_full_queue_is_waited_for_as_long_as_the_server_asks(
     slept: list[float], asked: Asked
 ) -> None:
-    server = Server(429, 200, headers={"Retry-After": "10"})
+    server = ScriptedServer(429, 200, headers={"Retry-After": "10"})
     assert asked(server, "submit", {}) == JOB
     assert slept == [10.0]
 
 
-class BreakingServer(Server):
+class BreakingServer(ScriptedServer):
     """A server that breaks as many connections as there are errors, and then answers."""
 
     def __init__(self, *errors: type[httpx.TransportError], first: bool = False) -> None:
@@ -273,7 +273,7 @@ def test_events_go_on_where_a_stream_broke(slept: list[float]) -> None:
         async with AsyncClient("http://here", transport=transport) as client:
             return [event["id"] async for event in client.events("job_1")]
 
-    assert awaited(work) == ["1", "2", "3"]
+    assert await_in_thread(work) == ["1", "2", "3"]
     assert slept == [0.5] * 4
 
 

@@ -11,8 +11,8 @@ from service.client import calls
 from service.client.async_client import AsyncClient
 from service.client.calls import Document, ServerUnreachable
 from service.client.client import Client
-from tests.limits import LIMIT_SECONDS
-from tests.rest import awaited
+from tests.support.limits import LIMIT_SECONDS
+from tests.support.service.web_app import await_in_thread
 
 HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nTransfer-Encoding: chunked\r\n\r\n"
 SECOND = b"last-event-id: 1"
@@ -74,7 +74,7 @@ def read_events_async(url: str) -> list[Document]:
         async with AsyncClient(url, timeout=3600.0) as client:
             return [event async for event in client.events("job_1")]
 
-    events: list[Document] = awaited(read)
+    events: list[Document] = await_in_thread(read)
     return events
 
 

@@ -11,8 +11,8 @@ import pytest
 from service.core import computed
 from service.core.computed import FRESH_SECONDS, MAX_WAITING, REUSE_FACTOR, ComputedValues
 from service.core.errors import ServiceBusy
-from tests.clocks import SecondsClock
-from tests.limits import LIMIT_SECONDS
+from tests.support.clocks import SecondsClock
+from tests.support.limits import LIMIT_SECONDS
 
 
 @pytest.fixture

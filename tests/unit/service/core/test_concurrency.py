@@ -8,7 +8,7 @@ import pytest
 from service.core import concurrency
 from service.core.concurrency import ConcurrencyLimit
 from service.core.errors import ServiceBusy
-from tests.limits import LIMIT_SECONDS
+from tests.support.limits import LIMIT_SECONDS
 
 
 def test_so_many_go_on_at_once_some_wait_and_the_others_are_refused(

@@ -29,7 +29,7 @@ from sysid.core.settings import (
 )
 from sysid.data.noise import Noise
 from sysid.identification.options import RunOptions
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from service.jobs.schemas import JobIn
 from sysid.core.errors import join_pointer, split_pointer
 
 
-def faults(**changes: Any) -> dict[str, str]:
+def list_faults(**changes: Any) -> dict[str, str]:
     body = {"model": "m", "datasets": ["d"], **changes}
     with pytest.raises(ValidationError) as refused:
         JobIn.model_validate(body)
@@ -18,22 +18,22 @@ def faults(**changes: Any) -> dict[str, str]:
 
 
 def test_the_names_of_unions_are_not_in_a_pointer() -> None:
-    assert list(faults(algorithm={"islands": "four"})) == ["/algorithm/islands"]
+    assert list(list_faults(algorithm={"islands": "four"})) == ["/algorithm/islands"]
 
 
 def test_an_unknown_field_inside_a_list_of_a_union_suggests_the_nearest() -> None:
-    found = faults(algorithm={"islands": [{"metod": "simple"}]})
+    found = list_faults(algorithm={"islands": [{"metod": "simple"}]})
     assert "did you mean 'method'?" in found["/algorithm/islands/0/metod"]
 
 
 def test_a_missing_field_has_the_place_where_it_should_be() -> None:
-    assert faults(sweep={"axes": [{"values": [1]}]}) == {
+    assert list_faults(sweep={"axes": [{"values": [1]}]}) == {
         "/sweep/axes/0/path": "this field is required"
     }
 
 
 def test_what_was_found_is_shown_but_not_at_length() -> None:
-    detail = faults(seed="x" * 1000)["/seed"]
+    detail = list_faults(seed="x" * 1000)["/seed"]
     assert "xxx" in detail
     assert len(detail) < 200
 

@@ -10,7 +10,7 @@ import pytest
 
 from service.core import temporary_files
 from sysid.core import machine
-from tests.limits import LIMIT_SECONDS
+from tests.support.limits import LIMIT_SECONDS
 from workers import local_ray, ray_folders
 from workers.errors import ClusterUnavailable
 
@@ -23,7 +23,7 @@ ELSEWHERE = "another boot pid:[4026531836]"
 
 
 @pytest.fixture
-def ended() -> int:
+def ended_process() -> int:
     """The number of a process that has ended."""
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
@@ -57,19 +57,19 @@ def test_a_file_that_goes_while_it_is_looked_at_is_no_fault(
 
 
 def test_a_living_process_of_another_pid_namespace_keeps_its_files_and_rays_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ended: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ended_process: int
 ) -> None:
     monkeypatch.setattr(ray_folders, "_choose_base_folder", lambda: tmp_path)
     with monkeypatch.context() as there:  # its number is there one that has ended here
         there.setattr(machine, "read_machine_id", lambda: ELSEWHERE)
-        there.setattr(os, "getpid", lambda: ended)
+        there.setattr(os, "getpid", lambda: ended_process)
         theirs = [
             tmp_path / f"{temporary_files.make_temporary_prefix()}file",
-            ray_folders.get_ray_folder(ended),
+            ray_folders.get_ray_folder(ended_process),
         ]
     for path in theirs:
         path.mkdir()
-    gone = ray_folders.get_ray_folder(ended)
+    gone = ray_folders.get_ray_folder(ended_process)
     gone.mkdir()
     temporary_files.remove_leftovers(tmp_path)
     ray_folders.clear_dead_dispatchers()

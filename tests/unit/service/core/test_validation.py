@@ -11,7 +11,7 @@ from service.core.validation import PYDANTIC_KINDS, describe_error, explain_erro
 from service.jobs.schemas import JobIn
 
 
-def told(kind: Any, value: Any) -> str:
+def explain_value(kind: Any, value: Any) -> str:
     with pytest.raises(ValidationError) as refused:
         TypeAdapter(kind).validate_python(value)
     return describe_error(refused.value.errors()[0], ())
@@ -60,7 +60,7 @@ def told(kind: Any, value: Any) -> str:
 def test_a_sentence_tells_what_was_found_and_what_would_be_right(
     kind: Any, value: Any, sentence: str
 ) -> None:
-    assert told(kind, value) == sentence
+    assert explain_value(kind, value) == sentence
 
 
 def test_no_sentence_of_pydantic_is_told() -> None:

@@ -10,7 +10,7 @@ from service.core.wire import Answer
 from sysid.core.types import FloatArray
 from sysid.core.value_documents import encode, has_fields, list_fields
 from sysid.results.result import Result
-from tests.results import conclude
+from tests.support.storage.run_results import conclude
 
 
 @dataclass(frozen=True)

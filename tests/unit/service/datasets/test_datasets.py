@@ -15,12 +15,12 @@ from service.datasets.signal_channels import map_channels
 from service.datasets.waveforms import InputSignals, interpolate_channel
 from service.storage.objects import FolderStore, StoredObject
 from sysid.data.records import Channel, History, Recording
-from tests.models import difference
+from tests.support.library.small_models import difference
 
 TIMES = np.arange(100) * 0.1
 
 
-def described(*channels: Channel) -> Any:
+def describe_channels(*channels: Channel) -> Any:
     content = StoredObject(sha256="", size=0)
     return describe_recording(
         Recording(channels),
@@ -32,14 +32,16 @@ def described(*channels: Channel) -> Any:
     )
 
 
-def channel(period: float, name: str = "u", **fields: Any) -> Channel:
+def make_channel(period: float, name: str = "u", **fields: Any) -> Channel:
     times = np.arange(20) * period
     return Channel(name, times, np.ones(20), **fields)
 
 
 def test_a_dataset_has_a_sampling_period_if_all_channels_share_it() -> None:
-    assert described(channel(0.1), channel(0.1, "y")).sample_time == pytest.approx(0.1)
-    two = described(channel(0.1), channel(0.2, "y"))
+    assert describe_channels(
+        make_channel(0.1), make_channel(0.1, "y")
+    ).sample_time == pytest.approx(0.1)
+    two = describe_channels(make_channel(0.1), make_channel(0.2, "y"))
     assert two.sample_time is None
     assert [entry["sample_time"] for entry in two.channels] == pytest.approx([0.1, 0.2])
 
@@ -49,7 +51,7 @@ def test_a_channel_tells_its_missing_values_and_its_history() -> None:
     one = Channel(
         "u", np.arange(3.0), values, "V", "zero", History(np.array([-2.0, -1.0]), np.ones(2))
     )
-    [entry] = described(one).channels
+    [entry] = describe_channels(one).channels
     assert (entry["missing"], entry["history_samples"], entry["history_start"]) == (1, 2, -2.0)
     assert (entry["start"], entry["stop"], entry["hold"]) == (0.0, 2.0, "zero")
 
@@ -61,14 +63,14 @@ def test_an_upload_of_just_the_largest_size_is_taken(tmp_path: Path) -> None:
         check_upload_size(1001, settings)
 
 
-def inputs(tmp_path: Path) -> InputSignals:
+def make_inputs(tmp_path: Path) -> InputSignals:
     return InputSignals(Session(), FolderStore(tmp_path), TIMES)
 
 
 def test_random_inputs_of_other_seeds_are_others(tmp_path: Path) -> None:
     def draw(**fields: Any) -> Any:
         signal = BinaryInput(kind="binary", period=0.3, **fields)
-        return inputs(tmp_path).evaluate_input("/inputs/u", signal)
+        return make_inputs(tmp_path).evaluate_input("/inputs/u", signal)
 
     assert len({draw(seed=seed).tobytes() for seed in range(5)}) == 5
     np.testing.assert_array_equal(draw(seed=2), draw(seed=2))
@@ -76,7 +78,7 @@ def test_random_inputs_of_other_seeds_are_others(tmp_path: Path) -> None:
 
 
 def test_a_wave_has_its_phase_and_offset_and_a_step_its_time(tmp_path: Path) -> None:
-    made = inputs(tmp_path)
+    made = make_inputs(tmp_path)
     wave = WaveInput(kind="cosine", amplitude=2, frequency=0.5, phase=0.3, offset=1)
     np.testing.assert_allclose(
         made.evaluate_input("", wave), 1 + 2 * np.cos(np.pi * TIMES + 0.3), atol=1e-12

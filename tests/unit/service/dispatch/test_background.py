@@ -10,7 +10,7 @@ import pytest
 
 from service.dispatch.background import BackgroundJobs
 from service.storage.columns import Document
-from tests.limits import LIMIT_SECONDS
+from tests.support.limits import LIMIT_SECONDS
 
 
 def until(holds: Callable[[], bool]) -> None:

@@ -16,7 +16,7 @@ from service.queue.packed_results import LAYOUTS, RESULT_ROWS, PackedResults, Ro
 from service.queue.run_writes import RunOutcome
 from service.storage.tables import Base
 from sysid.results.identification import Identification
-from tests.runs import RECORDS, spec
+from tests.support.cluster.small_runs import RECORDS, spec
 from workers.protocol import AdvanceRun, CompleteRun, RunConclusion
 from workers.tasks import process_pack
 

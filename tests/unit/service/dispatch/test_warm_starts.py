@@ -99,16 +99,16 @@ def nothing(_numbers: range) -> None:
 def test_what_an_earlier_attempt_ended_is_looked_for_once_and_newer_values_count() -> None:
     looked: list[range] = []
 
-    def stored(numbers: range) -> tuple[int, dict[str, float]]:
+    def find_stored(numbers: range) -> tuple[int, dict[str, float]]:
         looked.append(numbers)
         return 1, {"a": 1.0}
 
     chains = OpenChains(ChainLayout(1, 6), 6, always, {0, 1, 2})
     assert chains.take_ready(9, 6) == [3]
-    assert chains.find_previous_values(3, stored) == {"a": 1.0}
+    assert chains.find_previous_values(3, find_stored) == {"a": 1.0}
     chains.end_run(3, {"a": 3.0})
     assert chains.take_ready(9, 6) == [4]
-    assert chains.find_previous_values(4, stored) == {"a": 3.0}
+    assert chains.find_previous_values(4, find_stored) == {"a": 3.0}
     assert looked == [range(3)]
 
 

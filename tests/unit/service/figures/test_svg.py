@@ -28,12 +28,12 @@ def figure(*traces: dict[str, Any], **more: Any) -> dict[str, Any]:
     }
 
 
-def parsed(found: str) -> ElementTree.Element:
+def parse_drawing(found: str) -> ElementTree.Element:
     return ElementTree.fromstring(found.replace("<svg ", f'<svg xmlns="{SVG[1:-1]}" ', 1))
 
 
-def texts(found: str) -> list[str]:
-    return ["".join(one.itertext()) for one in parsed(found).iter(f"{SVG}text")]
+def list_texts(found: str) -> list[str]:
+    return ["".join(one.itertext()) for one in parse_drawing(found).iter(f"{SVG}text")]
 
 
 def line(x: list[Any], y: list[Any], **more: Any) -> dict[str, Any]:
@@ -123,7 +123,7 @@ def test_a_constant_line_is_drawn_at_half_height() -> None:
 @pytest.mark.parametrize(("x", "y"), [([], []), ([1], [None])])
 def test_of_a_line_without_points_only_the_axes_are_drawn(x: list[Any], y: list[Any]) -> None:
     found = str(to_svg(figure(line(x, y)), "empty"))
-    assert {"time [s]", "y [m]", "0", "1"} <= set(texts(found))
+    assert {"time [s]", "y [m]", "0", "1"} <= set(list_texts(found))
     assert re.findall(r'd="([^"]*)" fill="none"', found) == [""]
 
 
@@ -159,8 +159,8 @@ def test_the_band_is_closed_between_its_edges() -> None:
 def test_title_legend_axes_and_captions_are_written() -> None:
     caption = {"text": "<b>T</b> = 2·x<sup>1.4</sup>", "xref": "paper", "x": 0, "y": 1}
     found = str(to_svg(figure(line([0, 1], [0, 1]), annotations=[caption]), "What it shows"))
-    assert {"line", "time [s]", "y [m]", "T = 2·x1.4"} <= set(texts(found))
-    assert parsed(found).get("aria-label") == "What it shows"
+    assert {"line", "time [s]", "y [m]", "T = 2·x1.4"} <= set(list_texts(found))
+    assert parse_drawing(found).get("aria-label") == "What it shows"
 
 
 def test_what_is_written_by_a_user_is_no_markup() -> None:
@@ -168,7 +168,7 @@ def test_what_is_written_by_a_user_is_no_markup() -> None:
     made = figure(line([0, 1], [0, 1], name=evil), xaxis={"title": {"text": evil}})
     found = str(to_svg(made, evil))
     assert "<script" not in found
-    assert evil in texts(found)
+    assert evil in list_texts(found)
     assert to_markup("a<b>b</b>&") == 'a<tspan font-weight="600">b</tspan>&amp;'
 
 

@@ -4,7 +4,7 @@ from service.figures.trend import plot_trend, trend_height
 from service.trends.schemas import CoefficientOut, LawOut, PointOut, QuantityOut, TrendOut
 
 
-def quantity(name: str, kind: str, laws: list[LawOut]) -> QuantityOut:
+def find_quantity(name: str, kind: str, laws: list[LawOut]) -> QuantityOut:
     points = [
         PointOut(x=x, value=x, stderr=None, runs=["run"], status="measured", is_used=False)
         for x in (1.0, 2.0)
@@ -29,24 +29,24 @@ def power_law(a: float) -> LawOut:
     )
 
 
-def trend(*quantities: QuantityOut) -> TrendOut:
+def read_trend(*quantities: QuantityOut) -> TrendOut:
     return TrendOut(
         job="job", x="length_m", outliers="exclude", labels=[], quantities=list(quantities)
     )
 
 
-def captions(shown: TrendOut) -> list[str]:
+def list_captions(shown: TrendOut) -> list[str]:
     return [one["text"] for one in plot_trend(shown)["layout"]["annotations"]]
 
 
 def test_an_onset_delay_without_a_law_is_not_drawn_and_has_no_room() -> None:
-    parameter = quantity("L", "parameter", [])
-    both = trend(parameter, quantity("onset delay", "onset delay", []))
-    assert captions(both) == ["<b>L</b>: no law"]
-    many = trend(parameter, *[quantity("onset delay", "onset delay", [])] * 4)
-    assert trend_height(many) == trend_height(trend(parameter))
+    parameter = find_quantity("L", "parameter", [])
+    both = read_trend(parameter, find_quantity("onset delay", "onset delay", []))
+    assert list_captions(both) == ["<b>L</b>: no law"]
+    many = read_trend(parameter, *[find_quantity("onset delay", "onset delay", [])] * 4)
+    assert trend_height(many) == trend_height(read_trend(parameter))
 
 
 def test_a_law_is_written_with_its_label_and_powers_of_ten() -> None:
-    shown = trend(quantity("onset delay", "onset delay", [power_law(8.403e-5)]))
-    assert captions(shown) == ["<b>onset delay</b> = 8.403·10⁻⁵·length_m<sup>2.000</sup>"]
+    shown = read_trend(find_quantity("onset delay", "onset delay", [power_law(8.403e-5)]))
+    assert list_captions(shown) == ["<b>onset delay</b> = 8.403·10⁻⁵·length_m<sup>2.000</sup>"]

@@ -12,7 +12,7 @@ from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
 
 
-def refused(content: str | bytes, **options: object) -> UnreadableFile:
+def read_refusal(content: str | bytes, **options: object) -> UnreadableFile:
     data = content if isinstance(content, bytes) else content.encode()
     with pytest.raises(UnreadableFile) as caught:
         read_csv(data, **options)  # type: ignore[arg-type]
@@ -154,20 +154,20 @@ def test_equal_times_are_allowed_inside_repeats_only() -> None:
 
 
 def test_a_text_in_a_column_of_numbers_is_told_with_row_and_column() -> None:
-    error = refused("t,u,y\n0,1,2\n1,2,oops\n")
+    error = read_refusal("t,u,y\n0,1,2\n1,2,oops\n")
     assert (error.row, error.column) == (3, "y")
     assert "'oops'" in error.detail
     assert error.pointer == "/rows/3/y"
 
 
 def test_blank_rows_count_where_a_fault_is_told() -> None:
-    assert refused("t,u\n0,1\n\n\n1,2\n\n2,x\n").row == 7
-    assert refused("t,u\n0,1\n\n0,2\n").row == 4
+    assert read_refusal("t,u\n0,1\n\n\n1,2\n\n2,x\n").row == 7
+    assert read_refusal("t,u\n0,1\n\n0,2\n").row == 4
 
 
 def test_the_row_of_a_fault_far_down_is_right() -> None:
     rows = "".join(f"{k},{k}\n" for k in range(120_000))
-    assert refused(f"t,u\n{rows}120000,x\n").row == 120_002
+    assert read_refusal(f"t,u\n{rows}120000,x\n").row == 120_002
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_the_row_of_a_fault_far_down_is_right() -> None:
     [("0,1\n0.5,1\n0.5,2\n", "repeats"), ("0,1\n0.5,1\n0.25,2\n", "decreases")],
 )
 def test_repeated_and_decreasing_times_are_told_with_both_values(rows: str, words: str) -> None:
-    error = refused("t,u\n" + rows)
+    error = read_refusal("t,u\n" + rows)
     assert (error.row, error.column) == (4, "t")
     assert words in error.detail
     assert "0.5 s is followed by" in error.detail
@@ -217,27 +217,29 @@ def test_repeated_and_decreasing_times_are_told_with_both_values(rows: str, word
     ],
 )
 def test_what_cannot_be_used_is_refused_in_one_line(content: str, words: str) -> None:
-    assert words in refused(content).detail
+    assert words in read_refusal(content).detail
 
 
 def test_bytes_that_are_no_text_are_told_with_their_place() -> None:
-    assert refused(b"t,u\n0,1\n1,\xb5\n").row == 3
-    assert refused(b"t,u\n0,1\n\x01").byte == 8
-    assert refused(b"\x7fELF\0\0").byte == 4
+    assert read_refusal(b"t,u\n0,1\n1,\xb5\n").row == 3
+    assert read_refusal(b"t,u\n0,1\n\x01").byte == 8
+    assert read_refusal(b"\x7fELF\0\0").byte == 4
 
 
 def test_a_row_without_end_is_refused_before_it_fills_the_memory() -> None:
-    assert "longer than" in refused(b"t,u\n" + b"1" * 1_000_100).detail
+    assert "longer than" in read_refusal(b"t,u\n" + b"1" * 1_000_100).detail
 
 
 def test_time_told_twice_or_wrongly_is_refused() -> None:
-    assert "Remove it, or leave out sample_time" in refused("t,u\n0,1\n", sample_time=0.1).detail
-    assert "positive" in refused("u,y\n0,1\n", sample_time=0.0).detail
+    assert (
+        "Remove it, or leave out sample_time" in read_refusal("t,u\n0,1\n", sample_time=0.1).detail
+    )
+    assert "positive" in read_refusal("u,y\n0,1\n", sample_time=0.0).detail
 
 
 def test_an_unknown_label_column_is_refused_with_the_nearest() -> None:
-    assert "did you mean 'length'" in refused("t,length\n0,1\n", segments=("lenght",)).detail
-    assert "no signal" in refused("t,length\n0,1\n", segments=("length",)).detail
+    assert "did you mean 'length'" in read_refusal("t,length\n0,1\n", segments=("lenght",)).detail
+    assert "no signal" in read_refusal("t,length\n0,1\n", segments=("length",)).detail
 
 
 def test_channels_with_other_times_are_written_in_rows_of_their_own() -> None:
@@ -279,7 +281,7 @@ def test_a_channel_with_several_values_at_a_time_has_a_row_for_each() -> None:
 
 
 def test_a_stray_quote_is_told_with_its_row() -> None:
-    assert refused('t,u\n0,1\n1,2\n2,"3"x\n').row == 4
+    assert read_refusal('t,u\n0,1\n1,2\n2,"3"x\n').row == 4
 
 
 @pytest.mark.parametrize(
@@ -306,7 +308,7 @@ def test_more_signals_than_the_limit_are_refused_before_anything_below_the_heade
         ("a,b,c,d", {"sample_time": 1.0}),
         ("t,run,a,b,c,d", {"segments": ["run"]}),
     ):
-        error = refused(f"{header}\n0,this is no row\n", limits=limits, **options)
+        error = read_refusal(f"{header}\n0,this is no row\n", limits=limits, **options)
         assert error.row == 1
         assert f"the header has {header.count(',') + 1} columns; at most 3 signals" in str(error)
     assert len(read_csv(b"t,a,b,c\n0,1,2,3\n", limits=limits)[0].channels) == 3
@@ -315,4 +317,4 @@ def test_more_signals_than_the_limit_are_refused_before_anything_below_the_heade
 def test_more_rows_than_the_limit_are_refused() -> None:
     limits = replace(DEFAULT_LIMITS, messages=3)
     assert read_csv(b"t,u\n0,1\n1,2\n2,3\n", limits=limits)[0].channels[0].values.size == 3
-    assert "more than 3 rows" in str(refused("t,u\n0,1\n1,2\n2,3\n3,4\n", limits=limits))
+    assert "more than 3 rows" in str(read_refusal("t,u\n0,1\n1,2\n2,3\n3,4\n", limits=limits))

@@ -28,7 +28,7 @@ from service.formats.mcap import (
     write_recording,
 )
 from sysid.data.records import Channel, History, Recording, Segment
-from tests.mcap_files import read_run_record, recorded
+from tests.support.files.mcap_files import read_run_record, write_mcap_bytes
 
 TIMES = np.arange(40) * 0.01
 
@@ -84,7 +84,7 @@ def later_and_shorter() -> Recording:
 
 @pytest.mark.usefixtures("small_chunks")
 def test_every_checksum_is_stored_and_right() -> None:
-    content = recorded(two_bases())
+    content = write_mcap_bytes(two_bases())
     records = walk_records(content)
     chunks = [unpack_chunk(body) for opcode, body in records.values() if opcode == Opcode.CHUNK]
     assert len(chunks) == 4
@@ -102,7 +102,7 @@ def test_every_checksum_is_stored_and_right() -> None:
 
 @pytest.mark.usefixtures("small_chunks")
 def test_the_index_of_a_chunk_points_to_each_message_and_has_its_time() -> None:
-    content = recorded(later_and_shorter())
+    content = write_mcap_bytes(later_and_shorter())
     records = walk_records(content)
     summary = make_reader(BytesIO(content)).get_summary()
     assert summary is not None
@@ -138,7 +138,7 @@ def test_the_index_of_a_chunk_points_to_each_message_and_has_its_time() -> None:
 
 
 def test_the_statistics_span_all_topics() -> None:
-    summary = make_reader(BytesIO(recorded(later_and_shorter()))).get_summary()
+    summary = make_reader(BytesIO(write_mcap_bytes(later_and_shorter()))).get_summary()
     assert summary is not None
     statistics = summary.statistics
     assert statistics is not None
@@ -149,7 +149,7 @@ def test_the_statistics_span_all_topics() -> None:
 
 
 def test_the_offsets_of_the_summary_enclose_records_of_one_kind_each() -> None:
-    content = recorded(two_bases())
+    content = write_mcap_bytes(two_bases())
     records = walk_records(content)
     offsets = [
         record
@@ -170,13 +170,13 @@ def test_the_offsets_of_the_summary_enclose_records_of_one_kind_each() -> None:
 def test_times_before_zero_come_back() -> None:
     before = Channel("u", np.array([-0.5, -0.25, 0.0, 2.0]), np.arange(4.0))
     np.testing.assert_array_equal(
-        read_mcap(recorded(Recording((before,)))).channel("u").times, before.times
+        read_mcap(write_mcap_bytes(Recording((before,)))).channel("u").times, before.times
     )
 
 
 @pytest.mark.usefixtures("small_chunks")
 def test_the_plain_reader_finds_every_message_and_all_checksums_hold() -> None:
-    content = recorded(two_bases(), source="abc")
+    content = write_mcap_bytes(two_bases(), source="abc")
     reader = make_reader(BytesIO(content), validate_crcs=True)
     summary = reader.get_summary()
     assert summary is not None
@@ -200,7 +200,7 @@ def test_the_plain_reader_finds_every_message_and_all_checksums_hold() -> None:
 
 def test_protobuf_decodes_the_same_values_also_zero_and_nan() -> None:
     recording = two_bases()
-    reader = make_reader(BytesIO(recorded(recording)))
+    reader = make_reader(BytesIO(write_mcap_bytes(recording)))
     decoded: dict[str, list[float]] = {"u__x": [], "t": [], "other_base": []}
     for schema, _, message in reader.iter_messages():
         assert schema is not None
@@ -215,7 +215,7 @@ def test_protobuf_decodes_the_same_values_also_zero_and_nan() -> None:
 
 
 def test_a_part_of_the_time_can_be_read_through_the_index() -> None:
-    reader = make_reader(BytesIO(recorded(two_bases())))
+    reader = make_reader(BytesIO(write_mcap_bytes(two_bases())))
     found = list(
         reader.iter_messages(topics="/signals", starting_at=10**8, ending_before=2 * 10**8)
     )
@@ -223,7 +223,7 @@ def test_a_part_of_the_time_can_be_read_through_the_index() -> None:
 
 
 def test_names_units_holds_and_segments_come_back() -> None:
-    back = read_mcap(recorded(two_bases()))
+    back = read_mcap(write_mcap_bytes(two_bases()))
     assert back.names == ("u [x]", "other/base", "t")
     assert [one.unit for one in back.channels] == ["V", "m", "1"]
     assert [one.hold for one in back.channels] == ["zero", "auto", "band-limited"]
@@ -233,28 +233,28 @@ def test_names_units_holds_and_segments_come_back() -> None:
 def test_a_history_stands_in_topics_of_its_own() -> None:
     known = replace(two_bases().channels[0], history=History(TIMES[:3] - 1, np.ones(3)))
     with_history = Recording((known, *two_bases().channels[1:]), two_bases().segments)
-    reader = make_reader(BytesIO(recorded(with_history)))
+    reader = make_reader(BytesIO(write_mcap_bytes(with_history)))
     topics = [channel.topic for _, channel, _ in reader.iter_messages()]
     assert topics.count("/history") == 3
     assert len(topics) == 46
-    back = read_mcap(recorded(with_history)).channel("u [x]").history
+    back = read_mcap(write_mcap_bytes(with_history)).channel("u [x]").history
     assert back is not None
     np.testing.assert_array_equal(back.times, TIMES[:3] - 1)
 
 
 def test_the_repeats_of_pooled_samples_come_back() -> None:
     channel = Channel("y", [0.0, 0.1, 0.1], [1.0, 2.0, 3.0], repeats=np.array([1.0, 3.0, 2.0]))
-    back = read_mcap(recorded(Recording((channel,)))).channel("y")
+    back = read_mcap(write_mcap_bytes(Recording((channel,)))).channel("y")
     np.testing.assert_array_equal(back.repeats, [1.0, 3.0, 2.0])
     np.testing.assert_array_equal(back.values, channel.values)
 
 
 def test_the_same_recording_gives_the_same_bytes() -> None:
-    assert recorded(two_bases(), a="b") == recorded(two_bases(), a="b")
+    assert write_mcap_bytes(two_bases(), a="b") == write_mcap_bytes(two_bases(), a="b")
 
 
 def test_the_exact_sampling_period_is_kept_as_text() -> None:
-    content = recorded(Recording((Channel("u", TIMES, TIMES),)), parent="ds_1")
+    content = write_mcap_bytes(Recording((Channel("u", TIMES, TIMES),)), parent="ds_1")
     [record] = make_reader(BytesIO(content)).iter_metadata()
     metadata = record.metadata
     assert metadata["sample_time"] == "0.01"
@@ -263,12 +263,12 @@ def test_the_exact_sampling_period_is_kept_as_text() -> None:
 
 def test_a_reserved_metadata_key_is_refused() -> None:
     with pytest.raises(ValueError, match="channels"):
-        recorded(two_bases(), channels="mine")
+        write_mcap_bytes(two_bases(), channels="mine")
 
 
 def test_times_beyond_the_files_clock_are_refused() -> None:
     with pytest.raises(ValueError, match="63 bits"):
-        recorded(Recording((Channel("u", np.array([0.0, 1e10]), np.zeros(2)),)))
+        write_mcap_bytes(Recording((Channel("u", np.array([0.0, 1e10]), np.zeros(2)),)))
 
 
 def test_paths_are_written(tmp_path) -> None:
@@ -326,7 +326,7 @@ def test_the_widest_recording_is_written_within_the_limits_of_the_reader() -> No
     times = np.arange(7000) * 0.01
     zeros = np.zeros(times.size)
     names = [f"channel{number}" for number in range(DEFAULT_LIMITS.channels)]
-    content = recorded(Recording(tuple(Channel(name, times, zeros) for name in names)))
+    content = write_mcap_bytes(Recording(tuple(Channel(name, times, zeros) for name in names)))
     read = read_mcap(BytesIO(content), DEFAULT_LIMITS)
     assert [channel.name for channel in read.channels] == names
     np.testing.assert_array_equal(read.channels[-1].times, times)
@@ -338,8 +338,8 @@ def test_names_and_segments_that_the_reader_would_refuse_are_not_written(
     times = np.arange(3.0)
     long = [Channel(f"{'n' * 2000}{number}", times, times) for number in range(600)]
     with pytest.raises(ValueError, match="names of 600 channels are too long"):
-        recorded(Recording(tuple(long)))
+        write_mcap_bytes(Recording(tuple(long)))
     monkeypatch.setattr(mcap_writer, "DEFAULT_LIMITS", replace(DEFAULT_LIMITS, record_bytes=500))
     spans = tuple(Segment(float(n), n + 0.5, float(n), {"run": float(n)}) for n in range(20))
     with pytest.raises(ValueError, match="too many segments"):
-        recorded(Recording((Channel("u", np.arange(20.0), np.zeros(20)),), spans))
+        write_mcap_bytes(Recording((Channel("u", np.arange(20.0), np.zeros(20)),), spans))

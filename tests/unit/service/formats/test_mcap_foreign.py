@@ -15,7 +15,7 @@ from service.formats.mcap import read_mcap_with_notes
 from service.formats.mcap_messages import build_schema
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
-from tests.mcap_files import foreign, json_messages
+from tests.support.files.mcap_files import json_messages, write_foreign_bytes
 
 KINDS = {
     "value": Kind.TYPE_DOUBLE,
@@ -30,7 +30,7 @@ def read(content: bytes) -> tuple[Recording, tuple[str, ...]]:
     return read_mcap_with_notes(content, DEFAULT_LIMITS)
 
 
-def robot() -> FileDescriptorSet:
+def build_robot() -> FileDescriptorSet:
     """Schema of demo.Robot: numbers, a text, a list, and a joint that is itself a message."""
     files = FileDescriptorSet()
     file = files.file.add(name="robot.proto", package="demo", syntax="proto3")
@@ -52,15 +52,15 @@ def robot() -> FileDescriptorSet:
 
 def robot_file(rows: list[dict[str, object]]) -> bytes:
     pool = DescriptorPool()
-    pool.Add(robot().file[0])
+    pool.Add(build_robot().file[0])
     made = GetMessageClass(pool.FindMessageTypeByName("demo.Robot"))
     messages = []
     for k, row in enumerate(rows):
         message = made(**{name: value for name, value in row.items() if name != "angle"})
         message.joint.angle = row.get("angle", 0.0)
         messages.append(("/robot", k * 10**8, message.SerializeToString()))
-    schema = ("demo.Robot", "protobuf", robot().SerializeToString())
-    return foreign(messages, encoding="protobuf", schema=schema)
+    schema = ("demo.Robot", "protobuf", build_robot().SerializeToString())
+    return write_foreign_bytes(messages, encoding="protobuf", schema=schema)
 
 
 def test_protobuf_that_omits_zeros_is_read_with_its_nested_numbers() -> None:
@@ -88,7 +88,7 @@ def test_protobuf_that_omits_zeros_is_read_with_its_nested_numbers() -> None:
 @pytest.mark.parametrize("chunked", [True, False])
 def test_json_is_read_by_its_keys(compression: CompressionType, chunked: bool) -> None:
     messages = json_messages("/a", {"x": 1, "in": {"y": 2.5}, "text": "z"}, {"x": 3, "late": True})
-    recording, _ = read(foreign(messages, compression=compression, chunked=chunked))
+    recording, _ = read(write_foreign_bytes(messages, compression=compression, chunked=chunked))
     assert set(recording.names) == {"x", "in.y", "late"}
     np.testing.assert_array_equal(recording.channel("x").values, [1, 3])
     np.testing.assert_array_equal(recording.channel("in.y").values, [2.5, np.nan])
@@ -96,7 +96,9 @@ def test_json_is_read_by_its_keys(compression: CompressionType, chunked: bool) -
 
 
 def test_topics_keep_their_own_times_and_give_their_names() -> None:
-    content = foreign([*json_messages("/a", {"x": 1}, {"x": 2}), *json_messages("/b", {"x": 3})])
+    content = write_foreign_bytes(
+        [*json_messages("/a", {"x": 1}, {"x": 2}), *json_messages("/b", {"x": 3})]
+    )
     recording, _ = read(content)
     assert recording.names == ("a.x", "b.x")
     assert [one.times.size for one in recording.channels] == [2, 1]
@@ -104,7 +106,7 @@ def test_topics_keep_their_own_times_and_give_their_names() -> None:
 
 def test_the_times_of_a_clock_are_counted_from_the_first_exactly() -> None:
     start = 1_700_000_000_123_456_789
-    content = foreign([("/a", start + k * 10**6, b'{"x": 1}') for k in range(3)])
+    content = write_foreign_bytes([("/a", start + k * 10**6, b'{"x": 1}') for k in range(3)])
     recording, notes = read(content)
     np.testing.assert_array_equal(recording.channels[0].times, [0, 0.001, 0.002])
     assert any(str(start) in note for note in notes)
@@ -112,7 +114,9 @@ def test_the_times_of_a_clock_are_counted_from_the_first_exactly() -> None:
 
 def test_the_times_of_a_clock_are_counted_from_the_first_of_any_topic() -> None:
     start = 1_700_000_000_000_000_000
-    content = foreign([("/late", start + 10**9, b'{"x": 1}'), ("/early", start, b'{"x": 2}')])
+    content = write_foreign_bytes(
+        [("/late", start + 10**9, b'{"x": 1}'), ("/early", start, b'{"x": 2}')]
+    )
     recording, _ = read(content)
     assert recording.channel("early.x").times.tolist() == [0.0]
     assert recording.channel("late.x").times.tolist() == [1.0]
@@ -133,7 +137,7 @@ def test_two_topics_of_one_schema_do_not_mix_wherever_their_chunks_end() -> None
         for topic, sign in (("/a", 1), ("/b", -1))
     ]
     for size in (200, 1000, 10**6):
-        content = foreign(messages, encoding="protobuf", schema=PAIR, chunk_size=size)
+        content = write_foreign_bytes(messages, encoding="protobuf", schema=PAIR, chunk_size=size)
         recording, _ = read(content)
         assert recording.names == ("a.x", "a.y", "b.x", "b.y")
         for name, sign in (("a", 1), ("b", -1)):
@@ -148,20 +152,22 @@ def test_two_topics_of_one_schema_do_not_mix_wherever_their_chunks_end() -> None
 def test_fields_count_by_their_number_and_not_by_their_place() -> None:
     swapped = struct.pack("<BdBd", 0x11, 2.0, 0x09, 1.0)
     messages = [("/a", k, data) for k, data in enumerate([pair(1, 2), *[swapped] * 60])]
-    recording, _ = read(foreign(messages, encoding="protobuf", schema=PAIR, chunk_size=100))
+    recording, _ = read(
+        write_foreign_bytes(messages, encoding="protobuf", schema=PAIR, chunk_size=100)
+    )
     np.testing.assert_array_equal(recording.channel("x").values, np.ones(61))
     np.testing.assert_array_equal(recording.channel("y").values, np.full(61, 2.0))
 
 
 def test_messages_of_one_time_keep_their_order_when_a_topic_is_sorted() -> None:
     times = [5] * 50 + [1] * 50
-    content = foreign([("/a", time, b'{"x": %d}' % k) for k, time in enumerate(times)])
+    content = write_foreign_bytes([("/a", time, b'{"x": %d}' % k) for k, time in enumerate(times)])
     recording, _ = read(content)
     np.testing.assert_array_equal(recording.channel("x").values, [*range(50, 100), *range(50)])
 
 
 def test_messages_out_of_order_are_sorted_and_it_is_said() -> None:
-    content = foreign([("/a", 2, b'{"x": 2}'), ("/a", 1, b'{"x": 1}')])
+    content = write_foreign_bytes([("/a", 2, b'{"x": 2}'), ("/a", 1, b'{"x": 1}')])
     recording, notes = read(content)
     np.testing.assert_array_equal(recording.channels[0].values, [1, 2])
     assert any("not in order of time" in note for note in notes)
@@ -170,33 +176,38 @@ def test_messages_out_of_order_are_sorted_and_it_is_said() -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (foreign([]), "no channel"),
-        (foreign([("/a", 0, b"\0")], encoding="cdr"), "ROS 2 CDR"),
-        (foreign([("/a", 0, b"\0")], encoding="cbor"), "'cbor'"),
-        (foreign([("/a", 0, b"{")]), "not JSON"),
-        (foreign([("/a", 0, b"[1]")]), "not a JSON object"),
-        (foreign([("/a", 0, b'{"x": "text"}')]), "no signal"),
-        (foreign([("/a", 0, b'{"x": 1' + b"0" * 400 + b"}")]), "too large for a double"),
-        (foreign([("/a", 0, b"[" * 5000 + b"]" * 5000)]), "JSON"),
-        (foreign([("/a", 0, b"\x08")], encoding="protobuf"), "no protobuf schema"),
+        (write_foreign_bytes([]), "no channel"),
+        (write_foreign_bytes([("/a", 0, b"\0")], encoding="cdr"), "ROS 2 CDR"),
+        (write_foreign_bytes([("/a", 0, b"\0")], encoding="cbor"), "'cbor'"),
+        (write_foreign_bytes([("/a", 0, b"{")]), "not JSON"),
+        (write_foreign_bytes([("/a", 0, b"[1]")]), "not a JSON object"),
+        (write_foreign_bytes([("/a", 0, b'{"x": "text"}')]), "no signal"),
         (
-            foreign(
+            write_foreign_bytes([("/a", 0, b'{"x": 1' + b"0" * 400 + b"}")]),
+            "too large for a double",
+        ),
+        (write_foreign_bytes([("/a", 0, b"[" * 5000 + b"]" * 5000)]), "JSON"),
+        (write_foreign_bytes([("/a", 0, b"\x08")], encoding="protobuf"), "no protobuf schema"),
+        (
+            write_foreign_bytes(
                 [("/a", 0, b"\xff")],
                 encoding="protobuf",
-                schema=("demo.Robot", "protobuf", robot().SerializeToString()),
+                schema=("demo.Robot", "protobuf", build_robot().SerializeToString()),
             ),
             "does not follow its schema",
         ),
         (
-            foreign(
+            write_foreign_bytes(
                 [("/a", 0, b"")],
                 encoding="protobuf",
-                schema=("demo.Missing", "protobuf", robot().SerializeToString()),
+                schema=("demo.Missing", "protobuf", build_robot().SerializeToString()),
             ),
             "its schema cannot be used",
         ),
         (
-            foreign([("/a", 0, b"")], encoding="protobuf", schema=("x", "protobuf", b"\xff\xff")),
+            write_foreign_bytes(
+                [("/a", 0, b"")], encoding="protobuf", schema=("x", "protobuf", b"\xff\xff")
+            ),
             "its schema cannot be used",
         ),
     ],

@@ -27,7 +27,8 @@ from service.formats.text_files import open_text
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 from sysid.data.table_rules import ReadingNote
-from tests.recorded_files import (
+from tests.support.checkout import ROOT
+from tests.support.files.experiment_files import (
     INPUT,
     OUTPUT,
     START,
@@ -45,7 +46,6 @@ from tests.recorded_files import (
     write_parquet,
     write_sheet,
 )
-from tests.repository import ROOT
 
 ROWS = join_rows("t,u,y")
 BODY = ROWS.partition("\n")[2]

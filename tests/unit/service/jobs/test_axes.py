@@ -23,13 +23,13 @@ def job(*axes: dict[str, Any], **fields: Any) -> JobIn:
     return JobIn.model_validate({**body, **fields})
 
 
-def cells(body: JobIn) -> list[SweepCell]:
+def list_cells(body: JobIn) -> list[SweepCell]:
     return list(iterate_cells(build_axis_groups(body.sweep.axes, group_axes(body.sweep.axes))))
 
 
 def test_without_axes_there_is_one_cell_that_changes_nothing() -> None:
     body = job()
-    assert cells(body) == [SweepCell()]
+    assert list_cells(body) == [SweepCell()]
     whole = body.to_normal_form()
     assert build_run_body(whole, {}) == {
         name: value for name, value in whole.items() if name != "sweep"
@@ -45,7 +45,7 @@ def test_the_number_of_cells_is_the_product_of_the_axes(lengths: list[int]) -> N
             for path, n in zip(paths, lengths, strict=False)
         )
     )
-    found = cells(body)
+    found = list_cells(body)
     assert len(found) == count_runs(body, group_axes(body.sweep.axes))
     assert len({tuple(cell.values.items()) for cell in found}) == len(found)
     groups = build_axis_groups(body.sweep.axes, group_axes(body.sweep.axes))
@@ -60,7 +60,7 @@ def test_crossed_axes_give_the_last_one_fastest_and_zipped_ones_step_together() 
         {"path": "/skip", "values": [1, 2]},
         {"path": "/noise/seed", "values": [7, 8], "zip": "z"},
     )
-    found = cells(body)
+    found = list_cells(body)
     assert count_runs(body, group_axes(body.sweep.axes)) == len(found) == 8
     paths = ("/noise/sigma", "/seed", "/noise/seed", "/skip")
     assert [tuple(cell.values[path] for path in paths) for cell in found[:5]] == [
@@ -87,7 +87,7 @@ def test_a_cell_changes_its_fields_and_nothing_else() -> None:
 
 def test_a_logarithmic_axis_has_both_ends_and_equal_ratios() -> None:
     body = job({"path": "/noise/sigma", "log": [0.001, 1, 4]})
-    values = [cell.values["/noise/sigma"] for cell in cells(body)]
+    values = [cell.values["/noise/sigma"] for cell in list_cells(body)]
     assert values == pytest.approx([0.001, 0.01, 0.1, 1])
     assert values[-1] == 1
 

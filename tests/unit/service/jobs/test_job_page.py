@@ -15,7 +15,7 @@ from sysid.data.derivations import STEPS, derive_recording
 from sysid.data.noise import NOISE_KINDS
 from sysid.data.records import HOLDS, Channel, Recording, Segment
 from tests.documents.job import FIELDS, PAGE, write_page
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 PAGES = [(ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("job.md", "derive.md")]
 EXAMPLES = [
@@ -27,7 +27,7 @@ JOBS = [one for one in EXAMPLES if "model" in one]
 STEP_LISTS = [one for one in EXAMPLES if "steps" in one]
 
 
-def rows(page: str) -> dict[str, list[str]]:
+def list_rows(page: str) -> dict[str, list[str]]:
     """Cells of every row of a page's tables by the name in the first."""
     return {
         cells[1].strip().strip("`"): [cell.strip() for cell in cells[2:-1]]
@@ -36,7 +36,7 @@ def rows(page: str) -> dict[str, list[str]]:
     }
 
 
-ROWS, STEP_ROWS = map(rows, PAGES)
+ROWS, STEP_ROWS = map(list_rows, PAGES)
 
 
 def test_the_table_of_the_search_is_that_of_its_settings() -> None:

@@ -9,8 +9,8 @@ from service.storage.tables import Job, Run
 from sysid.core.value_documents import encode
 from sysid.models.catalogue.load import load_model
 from sysid.results.result import Result
-from tests.repository import ROOT
-from tests.results import conclude
+from tests.support.checkout import ROOT
+from tests.support.storage.run_results import conclude
 
 
 def test_fields_are_told_by_their_last_part_and_those_that_end_alike_in_full() -> None:

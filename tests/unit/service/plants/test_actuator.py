@@ -24,7 +24,7 @@ def supply(amplitude: float, hold: Hold = "first") -> Channel:
     return Channel("P_a", TIMES, amplitude * waves, "Pa", hold)
 
 
-def modelled(given: Channel, substeps: int) -> FloatArray:
+def simulate_model(given: Channel, substeps: int) -> FloatArray:
     model = parse_model({**copy_catalogue_document("actuator"), "solver": {"substeps": substeps}})
     names = ("J", "F_c", "F_max", "k_a", "k_c", "A_m", "B", "theta_s")
     values = {name: getattr(ARM, name) for name in names}
@@ -37,7 +37,7 @@ def modelled(given: Channel, substeps: int) -> FloatArray:
 def test_the_model_of_the_catalogue_tends_to_the_exact_plant(amplitude: float, hold: Any) -> None:
     given = supply(amplitude, hold)
     exact = simulate_actuator(ARM, given).channel("theta").values
-    errors = [float(np.sqrt(np.mean((modelled(given, n) - exact) ** 2))) for n in (8, 128)]
+    errors = [float(np.sqrt(np.mean((simulate_model(given, n) - exact) ** 2))) for n in (8, 128)]
     assert errors[0] < 2e-4
     assert errors[1] < 2e-5
     assert (np.max(np.abs(exact)) == ARM.theta_s) == (amplitude > 1e4)

@@ -25,7 +25,7 @@ PERIOD = 1e-3
 AMBIENT = 1e5
 
 
-def linear(tube: Tube, inlet: FloatArray) -> FloatArray:
+def build_linear(tube: Tube, inlet: FloatArray) -> FloatArray:
     """Far end of a tube after small changes at its inlet: Bessel functions, by FFT.
 
     G = 1/(cosh Γ + Z_c (sV/nP₀) sinh Γ); the gas in the volume exchanges heat with its walls, so
@@ -54,7 +54,7 @@ def linear(tube: Tube, inlet: FloatArray) -> FloatArray:
     return np.fft.irfft(np.fft.rfft(inlet) / (np.cosh(along) + end * np.sinh(along)), inlet.size)
 
 
-def pressure(values: FloatArray, period: float = PERIOD) -> Channel:
+def make_pressure(values: FloatArray, period: float = PERIOD) -> Channel:
     return Channel("P1", period * np.arange(values.size), values, "Pa")
 
 
@@ -68,15 +68,15 @@ def test_a_small_step_comes_through_as_the_linear_theory_says() -> None:
     inlet = ramp(0.1) - ramp(8.1)  # it returns, so that the FFT's period does not show
     tube = Tube(length_m=40.0, cells=320, modes=8)
     part = slice(0, 3000)
-    found = simulate_tube(tube, pressure(100 * inlet[part])).channel("P2").values / 100
-    assert float(np.sqrt(np.mean((found - linear(tube, inlet)[part]) ** 2))) < 6e-4
+    found = simulate_tube(tube, make_pressure(100 * inlet[part])).channel("P2").values / 100
+    assert float(np.sqrt(np.mean((found - build_linear(tube, inlet)[part]) ** 2))) < 6e-4
 
 
 def test_what_flows_in_is_in_the_volume_at_the_end() -> None:
     tube = Tube(length_m=5.0)
     values = np.full(4000, 3e5)
     values[:10] = 1e5
-    found = simulate_tube(tube, pressure(values))
+    found = simulate_tube(tube, make_pressure(values))
     assert found.channel("P2").values[5] == pytest.approx(1e5)
     assert found.channel("P2").values[-1] == pytest.approx(3e5, rel=1e-3)
 
@@ -93,7 +93,7 @@ def test_a_longer_tube_answers_later() -> None:
     values = np.full(2500, 2e5)
     values[:10] = 1e5
     ends = [
-        simulate_tube(Tube(length_m=length), pressure(values)).channel("P2").values
+        simulate_tube(Tube(length_m=length), make_pressure(values)).channel("P2").values
         for length in (10.0, 20.0, 40.0)
     ]
     late = [PERIOD * (np.argmax(end > 1.02e5) - 10) for end in ends]
@@ -146,11 +146,11 @@ def test_a_tube_that_cannot_be_is_told(changes: dict[str, Any], pointer: str) ->
 def test_inlets_that_cannot_be_and_simulations_that_take_too_long_are_told() -> None:
     tube = Tube(length_m=20.0)
     with pytest.raises(InvalidRecord, match="falls to"):
-        simulate_tube(tube, pressure(np.array([0.0, -2e5, 0.0])))
+        simulate_tube(tube, make_pressure(np.array([0.0, -2e5, 0.0])))
     with pytest.raises(InvalidRecord, match="two samples or more"):
-        simulate_tube(tube, pressure(np.array([0.0])))
+        simulate_tube(tube, make_pressure(np.array([0.0])))
     with pytest.raises(InvalidSettings, match="Request fewer samples"):
-        simulate_tube(Tube(cells=5000), pressure(np.zeros(10_000)))
+        simulate_tube(Tube(cells=5000), make_pressure(np.zeros(10_000)))
 
 
 def test_a_record_s_memory_is_bounded_and_no_period_is_too_long_to_be_told() -> None:

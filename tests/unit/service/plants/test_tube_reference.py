@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.plants.tube import Tube, build_excitation, simulate_tube_record
-from tests.needs import DATA
+from tests.support.requirements import DATA
 
 pytestmark = pytest.mark.data
 

@@ -7,18 +7,18 @@ from sysid.core.text import find_shown_error, format_interval, join_estimate, pl
 from sysid.uncertainty.estimates import Estimate
 
 
-def estimate(value: float, stderr: float | None) -> Estimate:
+def make_estimate(value: float, stderr: float | None) -> Estimate:
     ends = None if stderr is None else (value - 2 * stderr, value + 2 * stderr)
     return Estimate("L", "s", value, 0.0, 10.0, stderr, ends, "identified")
 
 
 def test_intervals_that_meet_tell_nothing_apart() -> None:
-    assert find_furthest_pair([estimate(1.0, 0.1), estimate(1.3, 0.1)]) is None
-    assert find_furthest_pair([estimate(1.0, 0.1), estimate(9.0, None)]) is None
+    assert find_furthest_pair([make_estimate(1.0, 0.1), make_estimate(1.3, 0.1)]) is None
+    assert find_furthest_pair([make_estimate(1.0, 0.1), make_estimate(9.0, None)]) is None
 
 
 def test_of_several_the_two_furthest_apart_are_named() -> None:
-    three = [estimate(1.0, 0.01), estimate(1.5, 0.01), estimate(1.2, 0.01)]
+    three = [make_estimate(1.0, 0.01), make_estimate(1.5, 0.01), make_estimate(1.2, 0.01)]
     assert find_furthest_pair(three) == (0, 1)
 
 

@@ -52,7 +52,7 @@ def test_a_fault_of_the_statement_is_not_tried_again() -> None:
     assert len(tries) == 1
 
 
-def raised(database: Database, statement: str, **values: object) -> OperationalError:
+def catch_error(database: Database, statement: str, **values: object) -> OperationalError:
     """What a statement that cannot be carried out raises."""
     with (
         pytest.raises((OperationalError, InterfaceError)) as caught,
@@ -72,7 +72,7 @@ def database(tmp_path: Path):
 def test_a_mistake_in_a_statement_is_not_taken_for_a_database_that_is_away(
     database: Database,
 ) -> None:
-    mistake = raised(database, "SELECT nothing FROM nowhere")
+    mistake = catch_error(database, "SELECT nothing FROM nowhere")
     assert isinstance(mistake, OperationalError)
     assert not retry.is_transient(mistake)
     tries = []
@@ -91,9 +91,9 @@ def test_a_locked_file_and_one_that_cannot_be_opened_may_pass(
 ) -> None:
     with database.write_session() as session:
         session.execute(text("SELECT 1"))  # a transaction begins with its first statement
-        assert retry.is_transient(raised(database, "SELECT 1"))
+        assert retry.is_transient(catch_error(database, "SELECT 1"))
     other = Database(make_sqlite_url(tmp_path / "absent" / "a.db"))
-    assert retry.is_transient(raised(other, "SELECT 1"))
+    assert retry.is_transient(catch_error(other, "SELECT 1"))
     other.dispose()
 
 

@@ -43,7 +43,7 @@ def group(sigma, method, scale=1.0, **changes):
     return GroupOut(**{**known, **changes})
 
 
-def summary(groups):
+def read_summary(groups):
     return SummaryOut(
         job="job_1",
         by=["/noise/sigma", "/algorithm/method"],
@@ -96,7 +96,7 @@ def test_the_tables_have_a_row_for_each_group_and_at_most_four_parameters_each()
     one = group(0.5, "simple")
     many = [one.parameters[0].model_copy(update={"name": name}) for name in names]
     found = build_sweep_tables(
-        summary([one.model_copy(update={"parameters": many})] * 3).model_dump()
+        read_summary([one.model_copy(update={"parameters": many})] * 3).model_dump()
     )
     assert [len(rows) for _, rows in found] == [3] * 4
     for headings, rows in found:
@@ -115,7 +115,7 @@ def test_the_tables_have_a_row_for_each_group_and_at_most_four_parameters_each()
     ],
 )
 def test_the_noise_and_the_error_of_the_response_have_the_unit_of_the_output(unit, sigma, error):
-    told = summary([group(0.5, "simple")]).model_copy(update={"rms_unit": unit})
+    told = read_summary([group(0.5, "simple")]).model_copy(update={"rms_unit": unit})
     headings, _ = build_sweep_tables(told.model_dump())[0]
     assert headings[0] == sigma
     assert error in headings
@@ -124,7 +124,7 @@ def test_the_noise_and_the_error_of_the_response_have_the_unit_of_the_output(uni
 def test_of_a_relative_sigma_what_was_typed_stands_beside_what_it_is_in_the_outputs_unit():
     one = group(0.1698, "simple")
     key = {"relative": 0.1, **one.key}
-    told = summary([one.model_copy(update={"key": key})]).model_copy(
+    told = read_summary([one.model_copy(update={"key": key})]).model_copy(
         update={"by": list(key), "rms_unit": "m"}
     )
     for headings, rows in build_sweep_tables(told.model_dump()):
@@ -159,7 +159,9 @@ def test_what_is_not_known_is_a_dash():
         rms_cramer_rao_bound=None,
         parameters=[blank],
     )
-    first, second = (rows[0] for _, rows in build_sweep_tables(summary([waiting]).model_dump()))
+    first, second = (
+        rows[0] for _, rows in build_sweep_tables(read_summary([waiting]).model_dump())
+    )
     assert first == ["0.5", "simple", "0/10", "–", "–", "–", "–"]
     assert second == ["0.5", "simple", "–", "–"]
 
@@ -174,7 +176,7 @@ def lines(figure, axis, dash=None):
 
 def test_each_plot_has_a_median_and_a_band_for_each_method():
     groups = [group(s, m, 1 + n) for s in SIGMAS for n, m in enumerate(("simple", "improved"))]
-    figure = plot_noise_sweep(summary(groups), "m")
+    figure = plot_noise_sweep(read_summary(groups), "m")
     for axis in ("x", "x2"):
         medians = [
             one for one in figure["data"] if one["xaxis"] == axis and one["mode"] == "lines+markers"
@@ -189,7 +191,7 @@ def test_each_plot_has_a_median_and_a_band_for_each_method():
 
 
 def test_the_bound_of_a_parameter_is_drawn_at_the_quantiles_of_the_band():
-    figure = plot_noise_sweep(summary([group(s, "improved") for s in SIGMAS]), "m")
+    figure = plot_noise_sweep(read_summary([group(s, "improved") for s in SIGMAS]), "m")
     assert "dash" in SERIES_DASHES
     (response,) = lines(figure, "x", "dash")
     median = np.median(np.random.default_rng(1).chisquare(1, 100_000)) ** 0.5  # one parameter
@@ -201,7 +203,7 @@ def test_the_bound_of_a_parameter_is_drawn_at_the_quantiles_of_the_band():
 
 
 def test_groups_are_drawn_in_the_order_of_their_noise():
-    figure = plot_noise_sweep(summary([group(s, "improved") for s in (1.0, 0.0, 0.5)]), "m")
+    figure = plot_noise_sweep(read_summary([group(s, "improved") for s in (1.0, 0.0, 0.5)]), "m")
     medians = [one for one in figure["data"] if one["mode"] == "lines+markers"]
     assert all(one["x"] == [0.0, 0.5, 1.0] for one in medians)
     assert medians[0]["y"] == pytest.approx([0.0, 0.25, 0.5])
@@ -209,7 +211,7 @@ def test_groups_are_drawn_in_the_order_of_their_noise():
 
 def test_a_sweep_that_has_given_nothing_yet_has_an_empty_figure():
     waiting = [group(0.5, "simple", rms_noise_free=None, parameters=[])]
-    assert plot_noise_sweep(summary(waiting), "m")["data"] == []
+    assert plot_noise_sweep(read_summary(waiting), "m")["data"] == []
 
 
 def test_only_a_sweep_over_the_deviation_has_the_figure():

@@ -12,7 +12,7 @@ from service.sweeps.output_spread import compute_spread
 from sysid.data.records import Channel, Recording
 
 
-def recordings(**values: list[float]) -> dict[str, Recording]:
+def make_recordings(**values: list[float]) -> dict[str, Recording]:
     return {
         name: Recording((Channel("y", np.arange(len(y)) * 0.1, np.array(y)),))
         for name, y in values.items()
@@ -22,7 +22,7 @@ def recordings(**values: list[float]) -> dict[str, Recording]:
 @pytest.fixture
 def spread_of(monkeypatch: pytest.MonkeyPatch) -> Any:
     def compute(**values: list[float]) -> float:
-        stored = recordings(**values)
+        stored = make_recordings(**values)
         monkeypatch.setattr(output_spread, "load_recording", lambda _, sha256: stored[sha256])
         rows = [SimpleNamespace(sha256=name) for name in stored]
         return compute_spread(None, rows, "y")

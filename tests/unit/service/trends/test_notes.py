@@ -11,7 +11,7 @@ from sysid.trends.trend import TrendEstimate, fit_trend
 BOUNDS = (0.0, 1.0)
 
 
-def noted(
+def describe_trend(
     x: list[float], y: list[float], predict: list[float], bounds: tuple[float, float] = BOUNDS
 ) -> str:
     errors = [0.001] * len(x)
@@ -27,7 +27,7 @@ LINE = ([5.0, 10.0, 20.0, 40.0], [0.011, 0.021, 0.041, 0.081])
 
 
 def test_a_prediction_inside_needs_no_note() -> None:
-    assert noted(*LINE, [30.0]) == ""
+    assert describe_trend(*LINE, [30.0]) == ""
 
 
 @pytest.mark.parametrize(
@@ -40,24 +40,24 @@ def test_a_prediction_inside_needs_no_note() -> None:
     ],
 )
 def test_what_physics_does_not_allow_is_noted(at: float, said: str) -> None:
-    assert said in noted(*LINE, [at])
+    assert said in describe_trend(*LINE, [at])
 
 
 def test_an_onset_delay_is_not_below_zero() -> None:
-    assert "(0 s or more)" in noted(*LINE, [-3.0], (0.0, inf))
+    assert "(0 s or more)" in describe_trend(*LINE, [-3.0], (0.0, inf))
 
 
 def test_why_there_is_no_power_law_is_noted() -> None:
-    told = noted([0.0, *LINE[0]], [0.001, *LINE[1]], [])
+    told = describe_trend([0.0, *LINE[0]], [0.001, *LINE[1]], [])
     assert "no power law: it needs x > 0, found 0" in told
-    assert "power law" not in noted(*LINE, [])
+    assert "power law" not in describe_trend(*LINE, [])
 
 
 @pytest.mark.parametrize("y", [[0.02, 0.021, 0.02, 0.021], [0.021, 0.02, 0.0205, 0.0205]])
 def test_a_law_that_tells_no_dependence_is_noted(y: list[float]) -> None:
-    assert "The points show no dependence on x" in noted(LINE[0], y, [])
+    assert "The points show no dependence on x" in describe_trend(LINE[0], y, [])
 
 
 def test_a_constant_whose_power_law_is_chosen_is_noted_by_its_exponent() -> None:
-    told = noted([1.0, 10.0, 100.0, 1000.0], [0.02, 0.0204, 0.0201, 0.0204], [])
+    told = describe_trend([1.0, 10.0, 100.0, 1000.0], [0.02, 0.0204, 0.0201, 0.0204], [])
     assert "the exponent of the chosen law" in told

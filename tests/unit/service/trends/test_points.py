@@ -12,7 +12,7 @@ from sysid.results.result import Agreements
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
 
 
-def row(run: str, x: float, cell: dict[str, Any] | None = None, **values: Any) -> TrendRow:
+def make_row(run: str, x: float, cell: dict[str, Any] | None = None, **values: Any) -> TrendRow:
     known = {
         "number": 0,
         "labels": {"x": x},
@@ -27,7 +27,7 @@ def row(run: str, x: float, cell: dict[str, Any] | None = None, **values: Any) -
     return TrendRow(**{**known, **values, "id": run, "cell": cell or {}})
 
 
-def parameter(
+def make_parameter(
     value: float,
     stderr: float | None,
     status: EstimateStatus = "identified",
@@ -47,7 +47,7 @@ def chosen(*rows: TrendRow) -> dict[float, list[str]]:
 
 def test_of_runs_on_the_same_data_the_best_is_taken_wherever_it_stands() -> None:
     worst, best, unknown = (
-        row(run, 2.0, {"/seed": seed}, best_rms=rms)
+        make_row(run, 2.0, {"/seed": seed}, best_rms=rms)
         for run, seed, rms in (("worst", 1, 0.9), ("best", 2, 0.1), ("unknown", 3, None))
     )
     for order in ([worst, best, unknown], [best, unknown, worst], [unknown, worst, best]):
@@ -56,18 +56,22 @@ def test_of_runs_on_the_same_data_the_best_is_taken_wherever_it_stands() -> None
 
 def test_runs_on_other_data_and_at_other_labels_are_points_of_their_own() -> None:
     rows = [
-        row("far", 8.0, {"/noise/seed": 1, "/seed": 1}, best_rms=0.01),
-        row("first", 2.0, {"/noise/seed": 1, "/seed": 1}, best_rms=0.5),
-        row("second", 2.0, {"/noise/seed": 2, "/seed": 1}, best_rms=0.1),
-        row("third", 2.0, {"/datasets": ["ds_2"], "/seed": 1}, best_rms=0.2),
+        make_row("far", 8.0, {"/noise/seed": 1, "/seed": 1}, best_rms=0.01),
+        make_row("first", 2.0, {"/noise/seed": 1, "/seed": 1}, best_rms=0.5),
+        make_row("second", 2.0, {"/noise/seed": 2, "/seed": 1}, best_rms=0.1),
+        make_row("third", 2.0, {"/datasets": ["ds_2"], "/seed": 1}, best_rms=0.2),
     ]
     assert chosen(*rows) == {2.0: ["first", "second", "third"], 8.0: ["far"]}
 
 
 def test_runs_of_one_label_are_weighted_by_their_errors() -> None:
-    precise = row("a", 2.0, {"/noise/seed": 1}, parameters=[parameter(0.1, 0.01, upper=0.5)])
-    vague = row("b", 2.0, {"/noise/seed": 2}, parameters=[parameter(0.13, 0.02, lower=-1.0)])
-    fixed = row("c", 4.0, parameters=[parameter(0.3, None, "at bound")])
+    precise = make_row(
+        "a", 2.0, {"/noise/seed": 1}, parameters=[make_parameter(0.1, 0.01, upper=0.5)]
+    )
+    vague = make_row(
+        "b", 2.0, {"/noise/seed": 2}, parameters=[make_parameter(0.13, 0.02, lower=-1.0)]
+    )
+    fixed = make_row("c", 4.0, parameters=[make_parameter(0.3, None, "at bound")])
     (quantity,) = build_quantities(group_by_label([precise, vague, fixed], "x"), [])
     pooled, alone = quantity.points
     assert pooled.estimate is not None
@@ -80,7 +84,7 @@ def test_runs_of_one_label_are_weighted_by_their_errors() -> None:
 
 
 def test_parameters_that_were_not_estimated_are_no_quantities_unless_named() -> None:
-    rows = [row("a", 2.0, parameters=[parameter(0.1, None, "fixed")])]
+    rows = [make_row("a", 2.0, parameters=[make_parameter(0.1, None, "fixed")])]
     assert build_quantities(group_by_label(rows, "x"), []) == []
     (named,) = build_quantities(group_by_label(rows, "x"), ["L"])
     assert named.points[0].value == 0.1

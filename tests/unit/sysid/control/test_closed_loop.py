@@ -18,15 +18,15 @@ from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.simulation.simulate import simulate
-from tests.catalogue_cases import ARM
-from tests.models import ARX
+from tests.support.library.catalogue_cases import ARM
+from tests.support.library.small_models import ARX
 
 ACTUATOR = ARM | {"theta_s": 0.75 * pi, "theta(0)": 0.0}
 TUBE = Transport(1.0, 0.35, 0.127)
 TIMES: FloatArray = 0.01 * np.arange(601.0)
 
 
-def stepped(height: float, unit: str = "rad") -> Channel:
+def make_step(height: float, unit: str = "rad") -> Channel:
     """A reference that is 0 before t = 0 and `height` from then on."""
     times = np.array([-0.01, 0.0, TIMES[-1]])
     return Channel("reference", times, np.array([0.0, height, height]), unit, hold="zero")
@@ -36,11 +36,11 @@ def arm(gain: float, transport: Transport | None = TUBE) -> tuple[FloatArray, St
     """Angle of the arm after a step of 90°, and what it is judged by."""
     control = PidControl("P_a", "theta", gain, 0.25e6, transport)
     loop = close_loop(load_model("actuator"), control)
-    angle = simulate(loop.model, [stepped(pi / 2)], ACTUATOR, times=TIMES).channel("theta").values
+    angle = simulate(loop.model, [make_step(pi / 2)], ACTUATOR, times=TIMES).channel("theta").values
     return angle, measure_step_response(TIMES, angle, at=0.0, before=0.0, after=pi / 2)
 
 
-def lag(output: str = "y", **fields: Any) -> Model:
+def build_lag(output: str = "y", **fields: Any) -> Model:
     """First-order lag behind a dead time."""
     document = {
         "name": "lag",
@@ -89,7 +89,7 @@ def test_without_the_tube_friction_leaves_14_degrees() -> None:
 def test_a_loop_in_the_differential_form_equals_the_same_loop_written_by_hand(
     transport: Transport | None, limit: float | None
 ) -> None:
-    loop = close_loop(lag(), PidControl("u", "y", 3.0, limit, transport))
+    loop = close_loop(build_lag(), PidControl("u", "y", 3.0, limit, transport))
     with_limit = "max(-1.5, min(1.5, 3*({0})))" if limit else "3*({0})"
     element = transport or Transport()
     error = with_limit.format(f"r(t - {element.delay}) - y(t - {element.delay})")
@@ -103,7 +103,7 @@ def test_a_loop_in_the_differential_form_equals_the_same_loop_written_by_hand(
         equations["y"] = f"({element.gain}*{drive} - y)/T"
     twin = parse_model(
         {
-            **lag().document,
+            **build_lag().document,
             "inputs": {"r": "m"},
             "states": states,
             "equations": equations,
@@ -111,8 +111,8 @@ def test_a_loop_in_the_differential_form_equals_the_same_loop_written_by_hand(
         }
     )
     values = {"T": 0.7, "L": 0.15}
-    found = simulate(loop.model, [stepped(2.0, "m")], values, times=TIMES)
-    reference = stepped(2.0)
+    found = simulate(loop.model, [make_step(2.0, "m")], values, times=TIMES)
+    reference = make_step(2.0)
     given = Channel("r", reference.times, reference.values, hold="zero")
     expected = simulate(twin, [given], values, times=TIMES).channel("y").values
     np.testing.assert_allclose(found.channel("y").values, expected, rtol=1e-9, atol=1e-12)
@@ -136,7 +136,7 @@ def test_a_recursion_that_answers_at_once_has_a_controller_one_step_late() -> No
     control = PidControl("u", "y", 1.1)
     loops = [close_loop(parse_model(one), control) for one in (direct, late)]
     assert [loop.controller_delay_steps for loop in loops] == [1, 0]
-    first, second = (simulate(loop.model, [stepped(1.0, "m")], {}, times=TIMES) for loop in loops)
+    first, second = (simulate(loop.model, [make_step(1.0, "m")], {}, times=TIMES) for loop in loops)
     x, expected = 0.0, []
     for _ in TIMES:
         expected.append(x)
@@ -163,7 +163,7 @@ def test_a_delay_of_a_step_or_more_is_no_circle(delay: float, steps_late: int, b
     control = PidControl("u", "y", 0.9, None, Transport(1.0, 0.0, delay))
     loop = close_loop(parse_model(DIRECT), control, 0.01)
     assert loop.controller_delay_steps == steps_late
-    found = simulate(loop.model, [stepped(1.0, "m")], {}, times=TIMES).channel("y").values
+    found = simulate(loop.model, [make_step(1.0, "m")], {}, times=TIMES).channel("y").values
     x = np.zeros(TIMES.size)
     grid = np.arange(TIMES.size)
     for k in range(1, TIMES.size):  # the command between samples is on a straight line
@@ -181,11 +181,13 @@ def test_during_a_dead_time_of_whole_steps_the_plant_goes_on() -> None:
     control = PidControl("u", "y", 0.9, None, Transport(1.0, 0.0, 0.1))
     loop = close_loop(plant, control, 0.01)
     steady = Channel("v", TIMES, np.ones(TIMES.size), "V")
-    found = simulate(loop.model, [stepped(0.0, "m"), steady], {}, times=TIMES).channel("y").values
+    found = simulate(loop.model, [make_step(0.0, "m"), steady], {}, times=TIMES).channel("y").values
     np.testing.assert_allclose(found[:10], 2.0 * (1.0 - 0.5 ** np.arange(10.0)), rtol=1e-12)
 
 
-@pytest.mark.parametrize("plant", [lag(), parse_model(DIRECT)], ids=["differential", "difference"])
+@pytest.mark.parametrize(
+    "plant", [build_lag(), parse_model(DIRECT)], ids=["differential", "difference"]
+)
 @pytest.mark.parametrize("time_constant", [0.0, 1.0])
 def test_other_numbers_of_controller_and_transport_need_no_other_kernel(
     plant: Model, time_constant: float
@@ -209,22 +211,22 @@ def test_a_polynomial_can_be_controlled() -> None:
     loop = close_loop(arx, PidControl("u", "y", 2.0))
     names = [parameter.name for parameter in arx.parameters]
     values = loop.rename_values(dict(zip(names, (0.8, 0.1), strict=True)))
-    found = simulate(loop.model, [stepped(1.0, "1")], values, times=TIMES).channel("y").values
+    found = simulate(loop.model, [make_step(1.0, "1")], values, times=TIMES).channel("y").values
     assert found[-1] == pytest.approx(0.2 / (1 - 0.8 + 0.2), rel=1e-9)
 
 
 def test_an_output_with_the_input_in_it_needs_a_transport_that_takes_time() -> None:
-    direct = lag("y + 0.1*u")
+    direct = build_lag("y + 0.1*u")
     with pytest.raises(InvalidSettings, match="algebraic loop"):
         close_loop(direct, PidControl("u", "y", 1.0, None, Transport(1.0, 0.0, 0.2)))
     loop = close_loop(direct, PidControl("u", "y", 1.0, None, Transport(1.0, 0.1, 0.0)))
-    found = simulate(loop.model, [stepped(1.0, "m")], {"T": 0.5, "L": 0.0}, times=TIMES)
+    found = simulate(loop.model, [make_step(1.0, "m")], {"T": 0.5, "L": 0.0}, times=TIMES)
     # y = x + 0.1 u and u = 1 - y at rest, where x = u
     assert found.channel("y").values[-1] == pytest.approx(1.1 / 2.1, rel=1e-6)
 
 
 def test_the_loop_names_its_signals_anew_where_the_plant_has_those_names() -> None:
-    taken = lag(
+    taken = build_lag(
         parameters={
             "T": {"lower": 0.1, "upper": 2},
             "L": {"lower": 0, "upper": 1},
@@ -250,7 +252,7 @@ def test_the_loop_names_its_signals_anew_where_the_plant_has_those_names() -> No
 )
 def test_what_cannot_be_controlled_is_told(make: Any, pointer: str, part: str) -> None:
     with pytest.raises(InvalidSettings, match=part) as caught:
-        close_loop(lag(), make())
+        close_loop(build_lag(), make())
     assert caught.value.pointer == pointer
 
 

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from service.control.schemas import ControlIn, RunSimulationIn
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 PAGE = (ROOT / "docs/control.md").read_text(encoding="utf-8")
 

@@ -23,7 +23,7 @@ TIMES: FloatArray = STEP * np.arange(901.0)
 VALUES = {"K": 1.6, "T": 0.7, "L": 0.2, "y(0)": 0.0}
 
 
-def lag(**fields: Any) -> Model:
+def build_lag(**fields: Any) -> Model:
     """First-order lag behind a dead time, with a load that is added to its input."""
     document = {
         "name": "lag",
@@ -56,13 +56,13 @@ RECURSION = parse_model(
 )
 
 
-def stepped(name: str, height: float, at: float = 0.0, before: float = 0.0) -> Channel:
+def make_step(name: str, height: float, at: float = 0.0, before: float = 0.0) -> Channel:
     """A held signal that steps once."""
     times = np.array([-1e-11, at, TIMES[-1]])
     return Channel(name, times, np.array([before, height, height]), hold="zero")
 
 
-def simulated(
+def simulate_loop(
     model: Model,
     control: PidControl,
     values: dict[str, float] = VALUES,
@@ -72,7 +72,7 @@ def simulated(
 ) -> tuple[ClosedLoop, Recording]:
     """A step of the reference at the start, and one of the load at 4 s."""
     loop = close_loop(model, control, STEP)
-    given = [stepped(loop.reference, reference), stepped("d", load, at=4.0)]
+    given = [make_step(loop.reference, reference), make_step("d", load, at=4.0)]
     return loop, loop.simulate(given, values, times=TIMES)
 
 
@@ -148,7 +148,7 @@ LIMITED = replace(PID, lower=-0.1, upper=0.72)
     ids=str,
 )
 def test_a_continuous_loop_equals_the_same_loop_in_fine_steps_by_hand(control: PidControl) -> None:
-    loop, found = simulated(lag(), control, load=0.3)
+    loop, found = simulate_loop(build_lag(), control, load=0.3)
     output, command = by_hand(control, load=0.3)
     # At the step itself the two may stand on either side of it; where its jump enters the plant, a
     # sample is off by a part of a step (decision 13).
@@ -161,7 +161,7 @@ def test_a_continuous_loop_equals_the_same_loop_in_fine_steps_by_hand(control: P
 
 def test_a_loop_that_starts_away_from_zero_has_no_kick_of_the_derivative() -> None:
     control = replace(PID, setpoint_weight=0.5)
-    loop, found = simulated(lag(), control, VALUES | {"y(0)": 0.8}, reference=1.0)
+    loop, found = simulate_loop(build_lag(), control, VALUES | {"y(0)": 0.8}, reference=1.0)
     output, command = by_hand(control, start=0.8)
     np.testing.assert_allclose(found.channel("y").values, output, atol=4e-3)
     np.testing.assert_allclose(found.channel(loop.command).values[2:], command[2:], atol=0.02)
@@ -209,7 +209,7 @@ class Textbook:
 )
 def test_a_recursion_has_the_sampled_controller_of_the_textbook(control: PidControl) -> None:
     values = {"a": 0.97, "b": 0.05, "x(0)": 0.3}
-    loop, found = simulated(RECURSION, control, values, load=0.2)
+    loop, found = simulate_loop(RECURSION, control, values, load=0.2)
     law, x = Textbook(control, STEP, before=-0.3), 0.3
     outputs, commands = [], []
     for t in TIMES:
@@ -236,7 +236,7 @@ def test_where_the_output_answers_at_once_the_textbooks_controller_is_late(delay
         }
     )
     control = replace(PID, gain=0.8, upper=0.9, transport=Transport(1.0, 0.0, delay))
-    loop, found = simulated(direct, control, {}, load=0.2)
+    loop, found = simulate_loop(direct, control, {}, load=0.2)
     late = max(round(delay / STEP), 1)
     law, x, commands, outputs = Textbook(control, STEP), 0.0, [0.0] * late, []
     for k, t in enumerate(TIMES):
@@ -266,18 +266,18 @@ def test_a_polynomial_is_controlled_without_a_steady_error() -> None:
     values = dict(zip([p.name for p in narx.parameters], (1.1, -0.3, 0.1, 0.05), strict=True))
     control = PidControl("u", "y", 0.5, integral_time=0.04, derivative_time=0.01, limit=3.0)
     loop = close_loop(narx, control, STEP)
-    found = loop.simulate([stepped(loop.reference, 0.5)], values, times=TIMES)
+    found = loop.simulate([make_step(loop.reference, 0.5)], values, times=TIMES)
     assert found.channel("y").values[-1] == pytest.approx(0.5, abs=1e-6)
 
 
-@pytest.mark.parametrize("plant", [lag(), RECURSION], ids=["differential", "difference"])
+@pytest.mark.parametrize("plant", [build_lag(), RECURSION], ids=["differential", "difference"])
 @pytest.mark.parametrize("limit", [None, 0.5])
 def test_without_integral_and_derivative_the_loop_is_the_proportional_one_bit_for_bit(
     plant: Model, limit: float | None
 ) -> None:
     values = {"a": 0.9, "b": 0.1, "x(0)": 0.2} if plant is RECURSION else VALUES
     plain = PidControl("u", "y", 1.3, limit, Transport(0.9, 0.1, 0.05))
-    _, expected = simulated(plant, plain, values)
+    _, expected = simulate_loop(plant, plain, values)
     same = replace(
         plain,
         integral_time=inf,
@@ -287,27 +287,27 @@ def test_without_integral_and_derivative_the_loop_is_the_proportional_one_bit_fo
         setpoint_weight=1.0,
         tracking_time=2.0,
     )
-    _, found = simulated(plant, same, values)
+    _, found = simulate_loop(plant, same, values)
     for one, other in zip(expected.channels, found.channels, strict=True):
         np.testing.assert_array_equal(one.values, other.values)
 
 
-@pytest.mark.parametrize("plant", [lag(), RECURSION], ids=["differential", "difference"])
+@pytest.mark.parametrize("plant", [build_lag(), RECURSION], ids=["differential", "difference"])
 def test_integral_action_leaves_no_steady_error_under_a_load_and_proportional_does(
     plant: Model,
 ) -> None:
     values = {"a": 0.98, "b": 0.03, "x(0)": 0.0} if plant is RECURSION else VALUES
     for control, is_zero in ((PI, True), (PID, True), (replace(PI, integral_time=None), False)):
-        _, found = simulated(plant, control, values, load=0.3)
+        _, found = simulate_loop(plant, control, values, load=0.3)
         error = 1.0 - found.channel("y").values[-1]
         assert (abs(error) < 1e-3) == is_zero
 
 
-@pytest.mark.parametrize("plant", [lag(), RECURSION], ids=["differential", "difference"])
+@pytest.mark.parametrize("plant", [build_lag(), RECURSION], ids=["differential", "difference"])
 def test_the_command_keeps_its_limits_and_reaches_them(plant: Model) -> None:
     values = {"a": 0.98, "b": 0.03, "x(0)": 0.0} if plant is RECURSION else VALUES
     control = replace(PID, gain=30.0, lower=-0.05, upper=0.9)
-    loop, found = simulated(plant, control, values)
+    loop, found = simulate_loop(plant, control, values)
     command = found.channel(loop.command).values
     assert np.max(command) == 0.9
     assert np.min(command) == -0.05
@@ -322,7 +322,7 @@ def test_back_calculation_bounds_the_overshoot_after_a_long_saturation() -> None
     led_back = replace(wound_up, anti_windup="back-calculation")
     for control in (wound_up, led_back, replace(led_back, tracking_time=0.05)):
         values = {**VALUES, "L": 0.0}
-        _, found = simulated(lag(), control, values, reference=1.0)
+        _, found = simulate_loop(build_lag(), control, values, reference=1.0)
         metrics = measure_step_response(
             TIMES, found.channel("y").values, at=0.0, before=0.0, after=1.0
         )
@@ -334,7 +334,7 @@ def test_back_calculation_bounds_the_overshoot_after_a_long_saturation() -> None
 
 def test_other_numbers_of_a_controller_need_no_other_kernel() -> None:
     variant = KernelVariant(one_step=False, soft=False, on_grid=True, weighted=False)
-    for plant in (lag(), RECURSION):
+    for plant in (build_lag(), RECURSION):
         keys = set()
         for size in (1.0, 1.3, 0.8):
             control = replace(
@@ -355,14 +355,14 @@ def test_other_numbers_of_a_controller_need_no_other_kernel() -> None:
 
 def test_steps_are_divided_where_the_filter_is_faster_than_they_are() -> None:
     fast = replace(PID, derivative_filter=100.0)  # its lag is 0.8 ms, a step 10 ms
-    loop, found = simulated(lag(), fast)
+    loop, found = simulate_loop(build_lag(), fast)
     assert loop.model.solver.substeps == 32
     output, _ = by_hand(fast, fine=320)
     np.testing.assert_allclose(found.channel("y").values, output, atol=4e-3)
-    assert close_loop(lag(), PID, STEP).model.solver.substeps == 2
-    assert close_loop(lag(), PI, STEP).model.solver.substeps == 1
+    assert close_loop(build_lag(), PID, STEP).model.solver.substeps == 2
+    assert close_loop(build_lag(), PI, STEP).model.solver.substeps == 1
     with pytest.raises(InvalidSettings, match="a smaller N, or a shorter") as caught:
-        close_loop(lag(), replace(PID, derivative_filter=1e6), STEP)
+        close_loop(build_lag(), replace(PID, derivative_filter=1e6), STEP)
     assert caught.value.pointer == "/derivative_filter"
 
 

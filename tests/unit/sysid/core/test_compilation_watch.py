@@ -6,7 +6,7 @@ import pytest
 
 from sysid.core import jit
 from sysid.core.jit import COMPILATION_NOTE, CompilationWatch, announce_compilation
-from tests.clocks import SecondsClock
+from tests.support.clocks import SecondsClock
 
 
 @pytest.fixture

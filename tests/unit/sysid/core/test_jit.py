@@ -42,7 +42,7 @@ def doubled(x):
 """
 
 
-def doubled(x: float) -> float:
+def double_value(x: float) -> float:
     return 2.0 * x
 
 
@@ -56,7 +56,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def hits() -> int:
     """How often a new copy of the function was found on disk; its result is right anyway."""
-    copy: Any = jit.jit_compile(doubled)
+    copy: Any = jit.jit_compile(double_value)
     assert copy(2.0) == 4.0
     return sum(copy.stats.cache_hits.values())
 
@@ -221,14 +221,14 @@ def test_code_compiled_while_an_update_replaces_sources_is_not_kept(tmp_path: Pa
 
 
 def test_what_was_loaded_is_taken_into_what_is_compiled_with_it(folder: Path) -> None:
-    def tripled(x: float) -> Any:
+    def triple_value(x: float) -> Any:
         return 3.0 * x + inner(x)
 
     for loaded in (0, 1):
-        inner: Any = jit.jit_compile(doubled)
+        inner: Any = jit.jit_compile(double_value)
         assert inner(2.0) == 4.0
         assert sum(inner.stats.cache_hits.values()) == loaded
-        outer: Any = numba.njit(tripled)
+        outer: Any = numba.njit(triple_value)
         assert outer(2.0) == 10.0
         code = outer.inspect_llvm(outer.signatures[0])
         assert not [
@@ -338,7 +338,7 @@ def test_a_function_of_numba_that_has_no_cache_works(
 
     monkeypatch.setattr(code_cache, "_logged_reasons", [])
     monkeypatch.setattr(numba, "njit", lambda **_: Plain)
-    assert jit.jit_compile(doubled)(2.0) == 4.0
+    assert jit.jit_compile(double_value)(2.0) == 4.0
     assert len(caplog.records) == 1
 
 
@@ -390,13 +390,13 @@ def test_processes_that_compile_at_once_leave_one_whole_file(tmp_path: Path) -> 
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     command = [sys.executable, "-c", PROGRAM, str(tmp_path), "a"]
 
-    def started() -> subprocess.Popen[str]:
+    def start_process() -> subprocess.Popen[str]:
         return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
 
-    racing = [started() for _ in range(2)]
+    racing = [start_process() for _ in range(2)]
     assert {one.communicate()[0].split()[0] for one in racing} == {"4.0"}
     assert len(os.listdir(tmp_path / "cache")) == 1
-    assert started().communicate()[0].split() == ["4.0", "1"]
+    assert start_process().communicate()[0].split() == ["4.0", "1"]
 
 
 def test_numba_is_bounded_where_its_insides_are_known() -> None:

@@ -141,7 +141,7 @@ def test_a_blank_unit_goes_with_every_unit(blank: str | None, unit: str) -> None
     assert describe_difference(blank, unit) == describe_difference(unit, blank) == ""
 
 
-def model(u: str = "Pa", y: str = "1") -> Model:
+def build_model(u: str = "Pa", y: str = "1") -> Model:
     return parse_model(
         {
             "name": "gauge",
@@ -156,7 +156,7 @@ def model(u: str = "Pa", y: str = "1") -> Model:
     )
 
 
-def record(u: str, y: str, name: str = "") -> Record:
+def make_record(u: str, y: str, name: str = "") -> Record:
     times = 0.1 * np.arange(30.0)
     return Record(
         (Channel("u", times, np.sin(times), u),), (Channel("y", times, np.cos(times), y),), name
@@ -169,42 +169,48 @@ def test_a_record_in_another_unit_than_the_model_is_refused_with_both_units() ->
         match=r"'u' is in kPa in record 'old', but in model 'gauge' "
         r"it is in Pa: 1 kPa is 1000 Pa; .*unit.*\"u\": \"Pa\"",
     ):
-        identify(model(), record("kPa", "1", "old"), TINY)
+        identify(build_model(), make_record("kPa", "1", "old"), TINY)
 
 
 @pytest.mark.parametrize(("u", "y"), [("Hz", "C"), ("rad/s", "°C")])
 def test_cycles_for_radians_and_degrees_for_coulombs_are_refused(u: str, y: str) -> None:
     with pytest.raises(InvalidRecord, match=r"correct the wrong unit"):
-        identify(model("rad/s", "C"), record(u, y), TINY)
+        identify(build_model("rad/s", "C"), make_record(u, y), TINY)
 
 
 def test_a_unit_that_cannot_be_read_is_accepted_with_a_warning() -> None:
-    found = identify(model("Pa"), record("counts", "1"), TINY)
+    found = identify(build_model("Pa"), make_record("counts", "1"), TINY)
     told = "'u' is in counts, but in Pa in the model. The units were not compared, because counts"
     assert any(told in one for one in found.warnings)
-    assert "read as a unit" not in "".join(identify(model(), record("Pa", "1"), TINY).warnings)
+    assert "read as a unit" not in "".join(
+        identify(build_model(), make_record("Pa", "1"), TINY).warnings
+    )
 
 
 def test_a_record_after_one_whose_unit_cannot_be_read_is_compared_with_the_next() -> None:
     with pytest.raises(InvalidRecord, match=r"'y' is in V in record 3, but in record 2 it is in m"):
-        identify(model(), [record("Pa", "counts"), record("Pa", "m"), record("Pa", "V")], TINY)
+        identify(
+            build_model(),
+            [make_record("Pa", "counts"), make_record("Pa", "m"), make_record("Pa", "V")],
+            TINY,
+        )
 
 
 def test_records_fitted_together_are_in_one_unit_where_the_model_has_none() -> None:
     with pytest.raises(
         InvalidRecord, match=r"'y' is in mm in record 2, but in record 1 it is in m"
     ):
-        identify(model(), [record("Pa", "m"), record("Pa", "mm")], TINY)
+        identify(build_model(), [make_record("Pa", "m"), make_record("Pa", "mm")], TINY)
 
 
 def test_validation_records_are_in_the_unit_of_those_that_are_fitted() -> None:
     with pytest.raises(InvalidRecord, match=r"'y' is in V in record 2, but .* it is in m"):
-        identify(model(), record("Pa", "m"), TINY, validation=record("", "V"))
+        identify(build_model(), make_record("Pa", "m"), TINY, validation=make_record("", "V"))
 
 
 def test_one_unit_written_in_two_ways_or_left_out_is_accepted() -> None:
-    records = [record("Pa", "m/s^2"), record("N/m²", "m/s²"), record("", "1")]
-    assert identify(model(), records, TINY).evaluations > 0
+    records = [make_record("Pa", "m/s^2"), make_record("N/m²", "m/s²"), make_record("", "1")]
+    assert identify(build_model(), records, TINY).evaluations > 0
 
 
 def test_a_derivation_converts_exactly_and_writes_down_a_unit_that_is_missing() -> None:
@@ -274,18 +280,18 @@ def test_channels_in_units_that_nobody_knows_are_told_and_others_are_not() -> No
 
 
 def test_two_units_of_one_quantity_are_told_where_the_model_does_not_give_both() -> None:
-    assert list_mixed_unit_warnings(model("Pa", "1"), [record("Pa", "kPa")])
-    (told,) = list_mixed_unit_warnings(model("1", "1"), [record("kPa", "Pa")])
+    assert list_mixed_unit_warnings(build_model("Pa", "1"), [make_record("Pa", "kPa")])
+    (told,) = list_mixed_unit_warnings(build_model("1", "1"), [make_record("kPa", "Pa")])
     assert "'u' is in kPa and 'y' in Pa" in told
     assert "1 kPa is 1000 Pa" in told
     assert '{"unit": {"u": "Pa"}}' in told
-    assert told in identify(model("1", "1"), record("kPa", "Pa"), TINY).warnings
+    assert told in identify(build_model("1", "1"), make_record("kPa", "Pa"), TINY).warnings
 
 
 @pytest.mark.parametrize(("u", "y"), [("Pa", "Pa"), ("Pa", "m"), ("1", "Pa"), ("bat", "Pa")])
 def test_of_one_unit_two_quantities_or_a_plain_number_nothing_is_told(u: str, y: str) -> None:
-    assert list_mixed_unit_warnings(model("1", "1"), [record(u, y)]) == []
+    assert list_mixed_unit_warnings(build_model("1", "1"), [make_record(u, y)]) == []
 
 
 def test_units_that_the_model_gives_are_not_told_of_its_channels() -> None:
-    assert list_mixed_unit_warnings(model("kPa", "Pa"), [record("kPa", "Pa")]) == []
+    assert list_mixed_unit_warnings(build_model("kPa", "Pa"), [make_record("kPa", "Pa")]) == []

@@ -13,7 +13,7 @@ from sysid.core.types import FloatArray
 from sysid.core.value_documents import Misfit, decode, decode_exactly, encode, encode_exactly
 
 
-class Pair(NamedTuple):
+class SizedName(NamedTuple):
     name: str
     size: int = 1
 
@@ -28,7 +28,7 @@ class Part:
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Whole:
     parts: tuple[Part, ...]
-    pair: Pair
+    pair: SizedName
     rows: FloatArray = field(metadata={"digits": 3})
     by_name: Mapping[str, float]
     is_good: bool = True
@@ -42,7 +42,7 @@ class Extended(Whole):
 def whole(**changes: Any) -> Whole:
     known = {
         "parts": (Part(value=1.5, ends=(0.5, 2.5)), Part(value=math.inf, kind="b")),
-        "pair": Pair("n", 2),
+        "pair": SizedName("n", 2),
         "rows": np.array([[1.23456, 2.0], [3.0, -4.0]]),
         "by_name": {"L": 0.1},
     }
@@ -70,7 +70,7 @@ def test_a_plain_document_is_read_as_the_value_and_null_as_nan() -> None:
     found = decode(Whole, DOCUMENT)
     assert found.parts[0] == whole().parts[0]
     assert math.isnan(found.parts[1].value)
-    assert found.pair == Pair("n", 2)
+    assert found.pair == SizedName("n", 2)
     assert found.rows.tolist() == DOCUMENT["rows"]
     assert encode(found) == DOCUMENT
 

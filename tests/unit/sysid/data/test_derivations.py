@@ -16,7 +16,7 @@ from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
 
 
-def recording(samples: int = 100) -> Recording:
+def make_recording(samples: int = 100) -> Recording:
     times = np.arange(samples) * 0.1
     rng = np.random.default_rng(1)
     return Recording(
@@ -44,75 +44,77 @@ def repeats() -> Recording:
     return Recording((Channel("u", times, values), Channel("y", times, values)), segments)
 
 
-def values(made: Recording, name: str) -> Any:
+def read_values(made: Recording, name: str) -> Any:
     return made.channel(name).values
 
 
 def test_steps_are_taken_one_after_the_other() -> None:
-    made = derive_recording(recording(), [{"trim": {"rows": [10, 20]}}, {"offset": {"y": 3}}])
-    np.testing.assert_allclose(values(made, "y"), 0.5 * made.channel("y").times)
+    made = derive_recording(make_recording(), [{"trim": {"rows": [10, 20]}}, {"offset": {"y": 3}}])
+    np.testing.assert_allclose(read_values(made, "y"), 0.5 * made.channel("y").times)
 
 
 def test_trimming_by_rows_and_by_time_agree() -> None:
-    by_rows = derive_recording(recording(), [{"trim": {"rows": [10, 21]}}])
-    by_time = derive_recording(recording(), [{"trim": {"start": 0.95, "stop": 2.05}}])
+    by_rows = derive_recording(make_recording(), [{"trim": {"rows": [10, 21]}}])
+    by_time = derive_recording(make_recording(), [{"trim": {"start": 0.95, "stop": 2.05}}])
     for name in ("u", "y"):
-        np.testing.assert_array_equal(values(by_rows, name), values(by_time, name))
+        np.testing.assert_array_equal(read_values(by_rows, name), read_values(by_time, name))
         np.testing.assert_array_equal(
-            by_rows.channel(name).times, recording().channel("u").times[10:21]
+            by_rows.channel(name).times, make_recording().channel("u").times[10:21]
         )
 
 
 def test_noise_has_its_deviation_is_drawn_by_the_seed_and_leaves_others_alone() -> None:
-    start = recording(20_000)
+    start = make_recording(20_000)
     step = {"noise": {"sigma": 0.2, "seed": 7, "channels": ["y"]}}
     first, again = derive_recording(start, [step]), derive_recording(start, [step])
-    added = values(first, "y") - values(start, "y")
-    np.testing.assert_array_equal(values(first, "y"), values(again, "y"))
-    np.testing.assert_array_equal(values(first, "u"), values(start, "u"))
+    added = read_values(first, "y") - read_values(start, "y")
+    np.testing.assert_array_equal(read_values(first, "y"), read_values(again, "y"))
+    np.testing.assert_array_equal(read_values(first, "u"), read_values(start, "u"))
     assert np.std(added) == pytest.approx(0.2, rel=0.05)
     assert abs(np.mean(added)) < 0.01
     other = derive_recording(start, [{"noise": {"sigma": 0.2, "seed": 8, "channels": ["y"]}}])
-    assert not np.array_equal(values(first, "y"), values(other, "y"))
+    assert not np.array_equal(read_values(first, "y"), read_values(other, "y"))
 
 
 def test_noise_is_the_same_as_that_of_a_job() -> None:
-    start = recording()
+    start = make_recording()
     derived = derive_recording(start, [{"noise": {"sigma": 0.2, "seed": 7, "channels": ["y"]}}])
     record = add_output_noise(start.to_record({"u": "u"}, {"y": "y"}), Noise(0.2, 7))
-    np.testing.assert_array_equal(values(derived, "y"), record.outputs[0].values)
+    np.testing.assert_array_equal(read_values(derived, "y"), record.outputs[0].values)
 
 
 def test_noise_of_two_channels_is_independent() -> None:
-    start = recording(5000)
+    start = make_recording(5000)
     made = derive_recording(start, [{"noise": {"sigma": 1, "seed": 1, "channels": ["u", "y"]}}])
-    a, b = (values(made, name) - values(start, name) for name in ("u", "y"))
+    a, b = (read_values(made, name) - read_values(start, name) for name in ("u", "y"))
     assert abs(np.corrcoef(a, b)[0, 1]) < 0.1
 
 
 def test_detrending_takes_away_what_it_says() -> None:
-    line = derive_recording(recording(), [{"detrend": {"kind": "linear", "channels": ["y"]}}])
-    np.testing.assert_allclose(values(line, "y"), 0, atol=1e-12)
-    mean = derive_recording(recording(), [{"detrend": {}}])
-    assert np.mean(values(mean, "u")) == pytest.approx(0, abs=1e-14)
+    line = derive_recording(make_recording(), [{"detrend": {"kind": "linear", "channels": ["y"]}}])
+    np.testing.assert_allclose(read_values(line, "y"), 0, atol=1e-12)
+    mean = derive_recording(make_recording(), [{"detrend": {}}])
+    assert np.mean(read_values(mean, "u")) == pytest.approx(0, abs=1e-14)
 
 
 def test_what_detrending_subtracted_gives_the_recording_back() -> None:
     before = [{"trim": {"start": 2}}, {"unit": {"y": "mm"}}]
     steps = [{"detrend": {"channels": ["y"]}}, {"detrend": {"kind": "linear"}}]
-    derived, subtracted = apply_steps(recording(), [*before, *steps])
+    derived, subtracted = apply_steps(make_recording(), [*before, *steps])
     assert [(one.channel, one.unit) for one in subtracted] == [("y", "mm"), ("u", "V"), ("y", "mm")]
     assert [one.slope == 0 for one in subtracted] == [True, False, False]
-    whole = derive_recording(recording(), before)
+    whole = derive_recording(make_recording(), before)
     for name in ("u", "y"):
         trends = [one for one in subtracted if one.channel == name]
         times = derived.channel(name).times
-        back = values(derived, name) + sum(t.value + t.slope * (times - t.time) for t in trends)
-        np.testing.assert_allclose(back, values(whole, name), atol=1e-9)
+        back = read_values(derived, name) + sum(
+            t.value + t.slope * (times - t.time) for t in trends
+        )
+        np.testing.assert_allclose(back, read_values(whole, name), atol=1e-9)
 
 
 def test_a_line_survives_resampling() -> None:
-    made = derive_recording(recording(), [{"resample": {"sample_time": 0.03}}])
+    made = derive_recording(make_recording(), [{"resample": {"sample_time": 0.03}}])
     y = made.channel("y")
     assert y.sampling.is_regular
     assert y.sampling.period == pytest.approx(0.03)
@@ -122,23 +124,23 @@ def test_a_line_survives_resampling() -> None:
 
 def test_resampling_a_held_input_never_invents_a_value() -> None:
     made = derive_recording(
-        recording(), [{"hold": {"u": "zero"}}, {"resample": {"sample_time": 0.03}}]
+        make_recording(), [{"hold": {"u": "zero"}}, {"resample": {"sample_time": 0.03}}]
     )
-    assert set(values(made, "u")) <= set(values(recording(), "u"))
+    assert set(read_values(made, "u")) <= set(read_values(make_recording(), "u"))
 
 
 def test_the_mean_of_each_period_is_taken() -> None:
-    start = recording(101)
+    start = make_recording(101)
     made = derive_recording(start, [{"resample": {"sample_time": 0.5, "method": "mean"}}])
-    assert values(made, "u")[2] == pytest.approx(np.mean(values(start, "u")[8:13]))
+    assert read_values(made, "u")[2] == pytest.approx(np.mean(read_values(start, "u")[8:13]))
 
 
 def test_a_sample_between_two_periods_counts_half_in_each() -> None:
-    start = recording(101)
+    start = make_recording(101)
     made = derive_recording(start, [{"resample": {"sample_time": 0.2, "method": "mean"}}])
-    u = values(start, "u")
+    u = read_values(start, "u")
     np.testing.assert_allclose(
-        values(made, "u")[1:50], (u[1:98:2] + 2 * u[2:99:2] + u[3:100:2]) / 4
+        read_values(made, "u")[1:50], (u[1:98:2] + 2 * u[2:99:2] + u[3:100:2]) / 4
     )
 
 
@@ -147,8 +149,8 @@ def test_a_common_grid_has_no_time_that_a_channel_lacks() -> None:
     early = Channel("u", np.arange(15) * 0.1, np.arange(15.0))
     made = derive_recording(Recording((early, late)), [{"resample": {"sample_time": 0.1}}])
     np.testing.assert_allclose(made.channel("u").times, 0.5 + np.arange(10) * 0.1)
-    np.testing.assert_allclose(values(made, "u"), np.arange(5.0, 15.0))
-    np.testing.assert_allclose(values(made, "y"), np.arange(10.0))
+    np.testing.assert_allclose(read_values(made, "u"), np.arange(5.0, 15.0))
+    np.testing.assert_allclose(read_values(made, "y"), np.arange(10.0))
 
 
 def test_a_held_input_is_averaged_over_the_period_for_which_it_is_then_held() -> None:
@@ -165,7 +167,7 @@ def test_a_held_input_is_averaged_over_the_period_for_which_it_is_then_held() ->
         -1,
         (-0.2 + 0.3 * 2) / 0.5,
     ]
-    np.testing.assert_allclose(values(made, "u"), expected, rtol=1e-12)
+    np.testing.assert_allclose(read_values(made, "u"), expected, rtol=1e-12)
 
 
 def test_a_gap_of_a_held_input_stays_one() -> None:
@@ -174,7 +176,7 @@ def test_a_gap_of_a_held_input_stays_one() -> None:
     made = derive_recording(
         Recording((held,)), [{"resample": {"sample_time": 0.5, "method": "mean"}}]
     )
-    np.testing.assert_array_equal(values(made, "u"), [0.1 * 3, np.nan, 0.1 * 3, 0.1 * 3])
+    np.testing.assert_array_equal(read_values(made, "u"), [0.1 * 3, np.nan, 0.1 * 3, 0.1 * 3])
 
 
 @pytest.mark.parametrize("hold", ["zero", "first"])
@@ -198,16 +200,18 @@ def test_a_lag_survives_resampling_by_means(hold: Hold) -> None:
 
 def test_the_two_parts_of_a_split_are_the_whole() -> None:
     parts = [
-        derive_recording(recording(), [{"split": {"fraction": 0.3, "part": part}}])
+        derive_recording(make_recording(), [{"split": {"fraction": 0.3, "part": part}}])
         for part in ("estimation", "validation")
     ]
     assert [part.samples for part in parts] == [70, 30]
-    joined = np.concatenate([values(part, "u") for part in parts])
-    np.testing.assert_array_equal(joined, values(recording(), "u"))
+    joined = np.concatenate([read_values(part, "u") for part in parts])
+    np.testing.assert_array_equal(joined, read_values(make_recording(), "u"))
 
 
 def test_hold_and_names_are_set() -> None:
-    made = derive_recording(recording(), [{"hold": {"u": "band-limited"}}, {"rename": {"u": "q"}}])
+    made = derive_recording(
+        make_recording(), [{"hold": {"u": "band-limited"}}, {"rename": {"u": "q"}}]
+    )
     assert made.names == ("q", "y")
     assert made.channel("q").hold == "band-limited"
 
@@ -228,19 +232,19 @@ def test_segments_are_selected_by_their_labels(condition: dict[str, Any], kept: 
     for piece, number in zip(made.split_segments(), kept, strict=True):
         whole = repeats().split_segments()[number - 1]
         np.testing.assert_array_equal(piece.channel("u").times, whole.channel("u").times)
-        np.testing.assert_array_equal(values(piece, "u"), values(whole, "u"))
+        np.testing.assert_array_equal(read_values(piece, "u"), read_values(whole, "u"))
 
 
 def test_clipping_limits_samples_history_and_no_other_channel_and_keeps_gaps() -> None:
-    made = recording()
+    made = make_recording()
     y = made.channel("y")
     gap = np.where(np.arange(y.values.size) == 70, np.nan, y.values)
     made = replace(made, channels=(made.channel("u"), replace(y, values=gap)))
     part = derive_recording(made, [{"trim": {"rows": [50, 100]}}])
-    low, high = np.nanquantile(values(part, "y"), [0.2, 0.6])
+    low, high = np.nanquantile(read_values(part, "y"), [0.2, 0.6])
     clipped = derive_recording(part, [{"clip": {"y": {"min": low, "max": high}}}])
-    expected = np.minimum(np.maximum(values(part, "y"), low), high)
-    np.testing.assert_array_equal(values(clipped, "y"), expected)
+    expected = np.minimum(np.maximum(read_values(part, "y"), low), high)
+    np.testing.assert_array_equal(read_values(clipped, "y"), expected)
     assert np.isnan(expected).sum() == 1
     before, after = (one.channel("y").history for one in (part, clipped))
     assert before is not None
@@ -248,7 +252,7 @@ def test_clipping_limits_samples_history_and_no_other_channel_and_keeps_gaps() -
     np.testing.assert_array_equal(after.values, np.clip(before.values, low, high))
     assert clipped.channel("u") is part.channel("u")
     above = derive_recording(part, [{"clip": {"y": {"min": low}}}])
-    assert np.nanmax(values(above, "y")) == np.nanmax(values(part, "y"))
+    assert np.nanmax(read_values(above, "y")) == np.nanmax(read_values(part, "y"))
 
 
 def test_pooling_puts_every_output_sample_at_its_own_time() -> None:
@@ -276,7 +280,7 @@ def test_one_wrong_repeat_does_not_move_a_pooled_input() -> None:
     segments = tuple(Segment(float(i), i + 0.2, 0.0, {"n": i}) for i in range(5))
     repeated = Recording((Channel("u", times, u), Channel("y", times, u)), segments)
     made = derive_recording(repeated, [{"pool": {"input": "u", "outputs": ["y"], "bin": 0.1}}])
-    np.testing.assert_array_equal(values(made, "u"), [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(read_values(made, "u"), [1.0, 2.0, 3.0])
 
 
 def test_a_pooled_input_is_that_of_all_repeats_where_outputs_are_those_of_some() -> None:
@@ -287,7 +291,7 @@ def test_a_pooled_input_is_that_of_all_repeats_where_outputs_are_those_of_some()
     alone = derive_recording(repeats(), [{"select": some}, {"pool": pooling}])
     for name, same in (("u", whole), ("y", alone)):
         np.testing.assert_array_equal(made.channel(name).times, same.channel(name).times)
-        np.testing.assert_array_equal(values(made, name), values(same, name))
+        np.testing.assert_array_equal(read_values(made, name), read_values(same, name))
     assert alone.channel("u").times.size < made.channel("u").times.size
     assert made.channel("y").times.size < whole.channel("y").times.size
 
@@ -353,7 +357,7 @@ def test_pooled_outputs_are_of_segments_that_exist() -> None:
 )
 def test_a_bad_step_is_told_with_its_pointer(steps: Any, pointer: str) -> None:
     with pytest.raises(InvalidSettings) as caught:
-        derive_recording(recording(), steps)
+        derive_recording(make_recording(), steps)
     assert caught.value.pointer == pointer
     assert "\n" not in str(caught.value)
 
@@ -376,5 +380,5 @@ def test_a_bad_condition_is_told_with_its_pointer(condition: dict[str, Any], poi
 @pytest.mark.parametrize("number", [10**400, -(10**400), float("inf"), float("nan"), True])
 def test_a_number_is_finite(number: float) -> None:
     with pytest.raises(InvalidSettings, match="need a finite number") as caught:
-        derive_recording(recording(), [{"trim": {"start": 0, "stop": number}}])
+        derive_recording(make_recording(), [{"trim": {"start": 0, "stop": number}}])
     assert caught.value.pointer == "/steps/0/trim/stop"

@@ -6,7 +6,7 @@ import pytest
 from sysid.core.errors import InvalidSettings
 from sysid.data.noise import Noise, add_output_noise, draw_noise
 from sysid.data.records import Channel, Record
-from tests.searching import clean, record
+from tests.support.library.search_problems import clean, record
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "uniform-sum"])

@@ -17,12 +17,12 @@ from sysid.data.records import (
 from sysid.data.splitting import split_record
 
 
-def ramp(name: str, samples: int = 10, period: float = 0.1) -> Channel:
+def make_ramp(name: str, samples: int = 10, period: float = 0.1) -> Channel:
     return Channel(name, np.arange(samples) * period, np.arange(samples, dtype=float))
 
 
 def test_a_record_carries_the_models_names() -> None:
-    recording = Recording((ramp("P1"), ramp("P2")))
+    recording = Recording((make_ramp("P1"), make_ramp("P2")))
     record = recording.to_record({"u": "P1"}, {"y": "P2"}, "tube")
     assert [one.name for one in (*record.inputs, *record.outputs)] == ["u", "y"]
     assert record.duration == pytest.approx(0.9)
@@ -30,7 +30,7 @@ def test_a_record_carries_the_models_names() -> None:
 
 def test_an_unknown_channel_is_told_with_the_nearest() -> None:
     with pytest.raises(InvalidRecord, match="did you mean 'P1'"):
-        Recording((ramp("P1"),)).to_record({"u": "P11"}, {"y": "P1"})
+        Recording((make_ramp("P1"),)).to_record({"u": "P11"}, {"y": "P1"})
 
 
 def test_of_very_many_names_a_message_lists_some() -> None:
@@ -41,7 +41,7 @@ def test_of_very_many_names_a_message_lists_some() -> None:
 
 
 def test_an_output_that_is_its_own_input_is_refused() -> None:
-    recording = Recording((ramp("P1"), ramp("P2")))
+    recording = Recording((make_ramp("P1"), make_ramp("P2")))
     with pytest.raises(InvalidRecord, match="'P2' is both input 'u' and output 'y'"):
         recording.to_record({"u": "P2"}, {"y": "P2"})
 
@@ -75,14 +75,14 @@ def test_a_part_holds_the_samples_at_both_of_its_ends() -> None:
 
 
 def test_a_record_is_known_before_its_start_as_long_as_all_inputs_are() -> None:
-    def known(since: float | None) -> Channel:
+    def make_input(since: float | None) -> Channel:
         before = None if since is None else np.arange(since, 0.0)
         history = None if before is None else History(before, np.ones(before.size))
         return Channel("u", np.arange(3.0), np.ones(3), history=history)
 
     output = Channel("y", np.arange(3.0), np.ones(3))
-    assert Record((known(-5.0), known(-2.0)), (output,)).history_duration == 2.0
-    assert Record((known(-5.0), known(None)), (output,)).history_duration == 0.0
+    assert Record((make_input(-5.0), make_input(-2.0)), (output,)).history_duration == 2.0
+    assert Record((make_input(-5.0), make_input(None)), (output,)).history_duration == 0.0
     assert Record((), (output,)).history_duration == 0.0
 
 
@@ -100,7 +100,7 @@ def test_one_sample_off_its_place_makes_a_long_record_irregular() -> None:
 
 
 def test_records_have_one_sampling_period_only_if_all_outputs_share_it() -> None:
-    slow, fast = (Record((), (ramp("y", 20, period),)) for period in (0.2, 0.1))
+    slow, fast = (Record((), (make_ramp("y", 20, period),)) for period in (0.2, 0.1))
     assert find_common_sample_time([slow, slow]) == pytest.approx(0.2)
     assert find_common_sample_time([slow, fast]) is None
 
@@ -119,7 +119,7 @@ def test_regular_and_irregular_times_are_told_apart() -> None:
 
 
 def test_splitting_gives_every_sample_to_one_part() -> None:
-    record = Record((ramp("u", 20, 0.05),), (ramp("y"),))
+    record = Record((make_ramp("u", 20, 0.05),), (make_ramp("y"),))
     estimation, validation = split_record(record, 0.3)
     assert [part.outputs[0].values.size for part in (estimation, validation)] == [7, 3]
     for before, kinds in ((record.inputs, "inputs"), (record.outputs, "outputs")):
@@ -131,10 +131,10 @@ def test_splitting_gives_every_sample_to_one_part() -> None:
 @pytest.mark.parametrize("fraction", [0.0, 1.0, -1.0, 0.01, float("nan")])
 def test_a_fraction_that_leaves_a_part_empty_is_refused(fraction: float) -> None:
     with pytest.raises(InvalidSettings, match="/validation/fraction"):
-        split_record(Record((), (ramp("y"),)), fraction)
+        split_record(Record((), (make_ramp("y"),)), fraction)
 
 
 def test_a_channel_without_samples_in_a_part_is_told() -> None:
     early = Channel("u", np.array([0.0]), np.array([1.0]))
     with pytest.raises(InvalidSettings, match="channel 'u' has no sample"):
-        split_record(Record((early,), (ramp("y"),)), 0.5)
+        split_record(Record((early,), (make_ramp("y"),)), 0.5)

@@ -24,7 +24,7 @@ DATES = [START + timedelta(seconds=float(time)) for time in TIMES]
 BERLIN = pd.DatetimeIndex(DATES, tz="Europe/Berlin")
 
 
-def frame(**more: object) -> pd.DataFrame:
+def make_frame(**more: object) -> pd.DataFrame:
     return pd.DataFrame({"P1 [bar]": VALUES, "P2": VALUES + 1, **more}, index=TIMES)
 
 
@@ -111,14 +111,14 @@ def test_a_history_may_be_lists() -> None:
 @pytest.mark.parametrize(
     "table",
     [
-        frame(),
-        frame().rename_axis("t [s]"),
-        frame().rename_axis("t").reset_index(),
-        frame().set_index(pd.Index(1000 * TIMES, name="time [ms]")),
-        frame().set_index(pd.DatetimeIndex(DATES)),
-        frame().set_index(BERLIN),
-        frame().set_index(BERLIN).rename_axis("Zeit").reset_index(),
-        frame().set_index(pd.to_timedelta(TIMES, unit="s")),
+        make_frame(),
+        make_frame().rename_axis("t [s]"),
+        make_frame().rename_axis("t").reset_index(),
+        make_frame().set_index(pd.Index(1000 * TIMES, name="time [ms]")),
+        make_frame().set_index(pd.DatetimeIndex(DATES)),
+        make_frame().set_index(BERLIN),
+        make_frame().set_index(BERLIN).rename_axis("Zeit").reset_index(),
+        make_frame().set_index(pd.to_timedelta(TIMES, unit="s")),
         {"t": TIMES, "P1 [bar]": VALUES, "P2": list(VALUES + 1)},
         np.array(
             list(zip(TIMES, VALUES, VALUES + 1, strict=True)),
@@ -172,11 +172,11 @@ def test_a_table_of_polars_is_a_recording() -> None:
 
 
 def test_the_clock_of_dates_is_kept_by_a_recording() -> None:
-    started = Recording(frame().set_index(BERLIN)).started_at
+    started = Recording(make_frame().set_index(BERLIN)).started_at
     assert started == BERLIN[0]
     assert started.hour == START.hour
-    assert Recording(frame().set_index(pd.DatetimeIndex(DATES))).started_at == START
-    assert Recording(frame()).started_at is None
+    assert Recording(make_frame().set_index(pd.DatetimeIndex(DATES))).started_at == START
+    assert Recording(make_frame()).started_at is None
 
 
 def test_a_series_is_a_channel_with_its_times() -> None:
@@ -334,7 +334,7 @@ def test_times_that_repeat_have_no_common_table() -> None:
         (lambda: Recording({"t [furlong]": [0, 1], "x": [1, 2]}), "'furlong', which is no unit"),
         (lambda: Recording(xr.DataArray(np.ones((2, 3)))), "has dimensions dim_0, dim_1"),
         (
-            lambda: Recording(frame().set_index(pd.MultiIndex.from_product([[0, 1], [2, 3]]))),
+            lambda: Recording(make_frame().set_index(pd.MultiIndex.from_product([[0, 1], [2, 3]]))),
             "has no times",
         ),
     ],

@@ -15,7 +15,7 @@ THETA = np.array([1.0, 4.0])
 APART = [0.02, 0.3]
 
 
-def posed(friction: str) -> Problem:
+def build_problem(friction: str) -> Problem:
     """A mass on a spring with friction, against a record of its own with noise."""
     document: dict[str, Any] = {
         "name": "rubbing",
@@ -43,17 +43,17 @@ def posed(friction: str) -> Problem:
     ],
 )
 def test_a_switch_is_named_with_its_smooth_form(friction: str, smooth: str) -> None:
-    [note] = warn_hard_switching(posed(friction), THETA, APART)
+    [note] = warn_hard_switching(build_problem(friction), THETA, APART)
     assert "RMS 0.02 to 0.3 m" in note
     assert smooth in note
     replaced = smooth.replace("/e", "/0.01")
-    rough, even = (posed(one).predict(THETA[None])[0] for one in (friction, replaced))
+    rough, even = (build_problem(one).predict(THETA[None])[0] for one in (friction, replaced))
     np.testing.assert_allclose(rough, even, atol=0.02)
-    assert warn_hard_switching(posed(replaced), THETA, APART) == []
+    assert warn_hard_switching(build_problem(replaced), THETA, APART) == []
 
 
 def test_islands_that_agree_and_losses_without_jumps_are_not_reported() -> None:
-    assert warn_hard_switching(posed("sign(v)"), THETA, [0.02, 0.0201, np.inf]) == []
-    assert warn_hard_switching(posed("where(v > 0, v, v)"), THETA, APART) == []
-    assert warn_hard_switching(posed("sign(q)*v"), THETA, APART) == []
-    assert warn_hard_switching(posed("abs(v)*v"), THETA, APART) == []
+    assert warn_hard_switching(build_problem("sign(v)"), THETA, [0.02, 0.0201, np.inf]) == []
+    assert warn_hard_switching(build_problem("where(v > 0, v, v)"), THETA, APART) == []
+    assert warn_hard_switching(build_problem("sign(q)*v"), THETA, APART) == []
+    assert warn_hard_switching(build_problem("abs(v)*v"), THETA, APART) == []

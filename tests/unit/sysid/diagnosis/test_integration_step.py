@@ -31,7 +31,7 @@ from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
 from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.estimates import Estimate
-from tests.catalogue_cases import CASES, made
+from tests.support.library.catalogue_cases import CASES, make_record
 
 FINE = 16
 N = 200
@@ -59,7 +59,7 @@ def two_lags(substeps: int) -> Model:
     return parse_model({**TWO_LAGS, "solver": {"substeps": substeps}})
 
 
-def sampled(values: Mapping[str, float], sd: float = 0.02, substeps: int = 200) -> Record:
+def sample_plant(values: Mapping[str, float], sd: float = 0.02, substeps: int = 200) -> Record:
     """A record of the plant itself: of steps far below its time constants, with white noise."""
     random = np.random.default_rng(3)
     times = np.arange(N, dtype=np.float64)
@@ -77,11 +77,11 @@ def deviation(one: Estimate, value: float) -> float:
     return abs(one.value - value) / one.stderr
 
 
-def noisy(name: str, times: int, share: float) -> Record:
+def make_noisy(name: str, times: int, share: float) -> Record:
     """A record of a catalogue model with a finer step, with white noise of a share of it."""
     model = load_model(name)
     model = replace_substeps(model, times * model.solver.substeps)
-    clean = made(model, replace(CASES[name], sigma=0.0))
+    clean = make_record(model, replace(CASES[name], sigma=0.0))
     random = np.random.default_rng(0)
     outputs = tuple(
         replace(
@@ -92,7 +92,7 @@ def noisy(name: str, times: int, share: float) -> Record:
     return Record(clean.inputs, outputs)
 
 
-def compared(model: Model, name: str, record: Record) -> tuple[tuple[Estimate, ...], HalfStep]:
+def halve_step(model: Model, name: str, record: Record) -> tuple[tuple[Estimate, ...], HalfStep]:
     """The estimate from the truth on, and what half the step changes."""
     problem, case = Problem.build(model, [record]), CASES[name]
     truth = {**case.truth, **case.initial}
@@ -108,9 +108,9 @@ def compared(model: Model, name: str, record: Record) -> tuple[tuple[Estimate, .
 
 def test_a_small_error_of_the_step_counts_where_the_noise_is_smaller() -> None:
     """It moves the output by 5e-4 of its size, and the estimates by nine standard errors."""
-    model, record = load_model("fopdt"), noisy("fopdt", FINE, 1e-3)
-    coarse, half = compared(model, "fopdt", record)
-    exact, fine = compared(replace_substeps(model, FINE * model.solver.substeps), "fopdt", record)
+    model, record = load_model("fopdt"), make_noisy("fopdt", FINE, 1e-3)
+    coarse, half = halve_step(model, "fopdt", record)
+    exact, fine = halve_step(replace_substeps(model, FINE * model.solver.substeps), "fopdt", record)
     assert fine.changes == {}
     assert half.problem.model.solver.substeps == 2 * model.solver.substeps
     values = {one.name: one.value for one in exact}
@@ -125,19 +125,19 @@ def test_a_small_error_of_the_step_counts_where_the_noise_is_smaller() -> None:
 
 def test_of_a_record_that_was_simulated_with_the_step_nothing_changes() -> None:
     for name in ("duffing-delay", "fopdt"):
-        assert compared(load_model(name), name, noisy(name, 1, 1e-5))[1].changes == {}
+        assert halve_step(load_model(name), name, make_noisy(name, 1, 1e-5))[1].changes == {}
 
 
 def test_estimates_that_stand_still_do_not_count_though_the_output_moves() -> None:
     """What no parameter can make up for is no error of an estimate."""
-    estimates, half = compared(load_model("tube"), "tube", noisy("tube", FINE, 2e-4))
+    estimates, half = halve_step(load_model("tube"), "tube", make_noisy("tube", FINE, 2e-4))
     assert all(one.stderr is not None for one in estimates if one.status == "identified")
     assert half.changes == {}
 
 
 @pytest.mark.parametrize("substeps", [1, 2, 4, 8])
 def test_a_stiff_plant_is_identified_at_any_substeps(substeps: int) -> None:
-    record = sampled(STIFF)
+    record = sample_plant(STIFF)
     found = identify(two_lags(substeps), record, QUICK)
     exact = by_name(identify(two_lags(32), record, QUICK))
     assert found.substeps >= 8
@@ -153,7 +153,7 @@ def test_a_stiff_plant_is_identified_at_any_substeps(substeps: int) -> None:
 
 
 def test_signals_of_a_finer_step_are_computed_again_bit_for_bit() -> None:
-    record = sampled(STIFF)
+    record = sample_plant(STIFF)
     found = identify(two_lags(1), record, QUICK, validation_fraction=0.3)
     assert found.substeps > 1
     records = prepare_records([record], fraction=0.3)
@@ -170,7 +170,7 @@ def test_signals_of_a_finer_step_are_computed_again_bit_for_bit() -> None:
 def test_a_standard_error_from_the_edge_of_stability_counts(substeps: int) -> None:
     """The fast lag lies at its bound, where the method is just stable: no value moves by much."""
     edge = 1.0 / (2.7 * substeps * STIFF["T1"])
-    record = sampled({**STIFF, "r": 2e-4}, substeps=1000)
+    record = sample_plant({**STIFF, "r": 2e-4}, substeps=1000)
     problem = Problem.build(
         two_lags(substeps), [record], parameters={"r": {"lower": edge, "upper": 1}}
     )
@@ -184,7 +184,7 @@ def test_a_standard_error_from_the_edge_of_stability_counts(substeps: int) -> No
 
 def test_a_lag_that_the_data_do_not_tell_has_the_error_of_a_short_step() -> None:
     wide = {"r": {"lower": 2e-4, "upper": 1}}
-    record = sampled({**STIFF, "r": 2e-4}, substeps=1000)
+    record = sample_plant({**STIFF, "r": 2e-4}, substeps=1000)
     long, short = (
         by_name(identify(two_lags(substeps), record, QUICK, parameters=wide))["L"].stderr
         for substeps in (1, 32)
@@ -195,21 +195,21 @@ def test_a_lag_that_the_data_do_not_tell_has_the_error_of_a_short_step() -> None
 
 
 def test_half_a_standard_error_is_a_change_and_a_tenth_is_none() -> None:
-    model, record = load_model("fopdt"), noisy("fopdt", FINE, 0.01)
-    _, half = compared(model, "fopdt", record)
+    model, record = load_model("fopdt"), make_noisy("fopdt", FINE, 0.01)
+    _, half = halve_step(model, "fopdt", record)
     assert 0.3 < float(half.changes["L"].split()[-6]) < 1.0
     quiet = replace_substeps(model, 4 * model.solver.substeps)
-    assert compared(quiet, "fopdt", record)[1].changes == {}
+    assert halve_step(quiet, "fopdt", record)[1].changes == {}
 
 
 def test_a_plant_that_is_not_stiff_keeps_its_step() -> None:
-    found = identify(two_lags(4), sampled(SLOW), QUICK)
+    found = identify(two_lags(4), sample_plant(SLOW), QUICK)
     assert found.substeps == 4
     assert not any("substeps" in text for text in found.warnings)
 
 
 def test_the_signals_of_a_result_are_those_of_its_step() -> None:
-    model, record = two_lags(1), sampled(STIFF)
+    model, record = two_lags(1), sample_plant(STIFF)
     found = identify(model, record, QUICK, validation_fraction=0.3)
     used = replace_substeps(model, found.substeps)
     assert found.substeps > 1
@@ -223,7 +223,7 @@ def test_the_signals_of_a_result_are_those_of_its_step() -> None:
     assert parse_model(used.document).solver == used.solver
 
 
-def unsettled(found: Identification) -> list[str]:
+def list_unsettled(found: Identification) -> list[str]:
     """What is said of the estimates that half the step would change."""
     return [
         one.reason
@@ -236,35 +236,35 @@ def unsettled(found: Identification) -> list[str]:
 @pytest.mark.parametrize("most", [300, 800])
 def test_a_budget_that_leaves_no_finer_fit_is_kept_and_told(most: int) -> None:
     tight = replace(QUICK, stop=Stop(evaluations=most, settled=None))
-    found = identify(two_lags(1), sampled(STIFF), tight)
+    found = identify(two_lags(1), sample_plant(STIFF), tight)
     assert found.evaluations <= most
-    reasons = unsettled(found)
+    reasons = list_unsettled(found)
     assert reasons
     assert all(reason.endswith("the budget of evaluations") for reason in reasons)
 
 
 def test_a_time_limit_that_leaves_no_finer_fit_is_told() -> None:
-    problem = Problem.build(two_lags(1), [sampled(STIFF)])
+    problem = Problem.build(two_lags(1), [sample_plant(STIFF)])
     limited = replace(QUICK, stop=Stop(seconds=1.0))
     state = advance_run(problem, QUICK, begin_run(problem, QUICK, 1))
     late = conclude_run(problem, limited, replace(state, seconds=1e9), clock=lambda: 0.0)
     assert late.substeps == 1
-    reasons = unsettled(late)
+    reasons = list_unsettled(late)
     assert reasons
     assert all(reason.endswith("the time limit") for reason in reasons)
     assert all(any(reason in text for text in late.warnings) for reason in reasons)
 
 
 def test_estimates_that_are_not_refined_stay_and_are_not_called_identified() -> None:
-    found = identify(two_lags(1), sampled(STIFF), replace(QUICK, refine=False))
+    found = identify(two_lags(1), sample_plant(STIFF), replace(QUICK, refine=False))
     assert found.substeps == 1
-    assert unsettled(found)
+    assert list_unsettled(found)
 
 
 def test_under_a_noise_model_estimates_that_still_change_are_not_called_identified(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    record = sampled(STIFF)
+    record = sample_plant(STIFF)
     (outlet,) = record.outputs
     slow = lfilter([1.0], [1.0, -0.8], np.random.default_rng(5).normal(0.0, 0.02, N))
     record = replace(record, outputs=(replace(outlet, values=outlet.values + slow),))
@@ -272,11 +272,11 @@ def test_under_a_noise_model_estimates_that_still_change_are_not_called_identifi
     found = identify(two_lags(1), record, QUICK, loss=Loss(noise_model="ar1"))
     assert found.substeps == 1
     assert found.correlation_times["y"] > 0
-    assert unsettled(found)
+    assert list_unsettled(found)
 
 
 def test_the_limits_of_a_finer_fit_have_names() -> None:
-    record = sampled(STIFF)
+    record = sample_plant(STIFF)
     finest, coarse = (
         HalfStep(Problem.build(two_lags(substeps), [record]), np.zeros(4), {}, {}, 0)
         for substeps in (MAX_SUBSTEPS, 2)
@@ -295,7 +295,7 @@ def test_a_finer_fit_starts_from_what_is_best_with_the_finer_step() -> None:
     """The last champion may owe its fit to the longer step."""
     truth = np.array([STIFF[name] for name in ("K", "T1", "r", "L")])
     far = truth * np.array([1.0, 1.0, 4.0, 1.3])
-    half = HalfStep(Problem.build(two_lags(8), [sampled(STIFF)]), far, {}, {}, 0)
+    half = HalfStep(Problem.build(two_lags(8), [sample_plant(STIFF)]), far, {}, {}, 0)
     starts, rms, count = choose_starts(half, [[truth, far], [far]])
     np.testing.assert_array_equal(starts, [truth, far])
     np.testing.assert_array_equal(rms, half.problem.evaluate_fitness(np.array([truth, far])))
@@ -311,7 +311,7 @@ def test_an_interval_wider_than_the_range_identifies_nothing(
 ) -> None:
     bounds = {"lower": STIFF["L"] - half_range, "upper": STIFF["L"] + half_range}
     fields = {"r": {"fixed": SLOW["r"]}, "L": bounds}
-    lag = by_name(identify(two_lags(4), sampled(SLOW, sd=0.5), QUICK, parameters=fields))["L"]
+    lag = by_name(identify(two_lags(4), sample_plant(SLOW, sd=0.5), QUICK, parameters=fields))["L"]
     assert lag.stderr is not None
     assert 0.3 < lag.stderr < 0.5
     assert lag.status == status
@@ -346,7 +346,7 @@ def test_without_noise_a_small_move_is_an_error_and_no_doubt() -> None:
 def test_a_move_that_is_not_small_or_of_a_noisy_record_is_a_doubt() -> None:
     small = Estimate("L", "s", 0.5, 0.0, 2.0, 1e-6, (0.499998, 0.500002), "identified")
     half = HalfStep(
-        Problem.build(two_lags(8), [sampled(STIFF)]), np.zeros(4), {"L": "far"}, {"L": 4e-6}, 0
+        Problem.build(two_lags(8), [sample_plant(STIFF)]), np.zeros(4), {"L": "far"}, {"L": 4e-6}, 0
     )
     (kept,) = integration_step.mark_changing((small,), half, "limit")
     assert (kept.status, kept.value) == ("identified", 0.5)

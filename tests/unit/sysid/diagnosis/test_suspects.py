@@ -12,8 +12,8 @@ from sysid.residuals.whitening import Whitening
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
-from tests.models import LINE
-from tests.profiles import draw_seeds
+from tests.support.library.small_models import LINE
+from tests.support.profiles import draw_seeds
 
 N, NOISE = 300, 0.05
 TIMES = 0.2 * np.arange(N)

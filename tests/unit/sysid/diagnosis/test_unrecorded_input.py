@@ -24,7 +24,7 @@ FOPDT = load_model("fopdt")
 BOUNDS: dict[str, dict[str, Any]] = {"L": {"upper": 1.5}, "T": {"upper": 5}}
 
 
-def recorded(seed: int, *, was_at_rest: bool, samples: int = 300) -> Recording:
+def make_recording(seed: int, *, was_at_rest: bool, samples: int = 300) -> Recording:
     """A random binary test of a first-order lag with dead time; the cut is at sample 120."""
     rng = np.random.default_rng(seed)
     count = CUT + samples
@@ -41,40 +41,47 @@ def recorded(seed: int, *, was_at_rest: bool, samples: int = 300) -> Recording:
     return Recording((channel, noisy))
 
 
-def posed(recording: Recording, *, history: bool, model: Model = FOPDT, skip: int = 0) -> Problem:
+def build_problem(
+    recording: Recording, *, history: bool, model: Model = FOPDT, skip: int = 0
+) -> Problem:
     part = derive_recording(recording, [{"trim": {"rows": [CUT, CUT + 300], "history": history}}])
     record = part.to_record({"u": "u"}, {"y": "y"})
     return Problem.build(model, [record], parameters=BOUNDS, skip=skip)
 
 
-def analysed(problem: Problem) -> Analysis:
+def analyse_problem(problem: Problem) -> Analysis:
     start = np.array([TRUE.get(one.name, 0.0) for one in problem.free_parameters])
     [found] = refine_candidates(problem, [start])
     assert found is not None
     return analyse_estimate(problem, found.theta)
 
 
-def notes(problem: Problem) -> list[str]:
-    return warn_unrecorded_input(problem, analysed(problem), is_contradicted=False)
+def list_notes(problem: Problem) -> list[str]:
+    return warn_unrecorded_input(problem, analyse_problem(problem), is_contradicted=False)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_record_that_begins_in_the_middle_of_a_test_is_told_of(seed: int) -> None:
-    recording = recorded(seed, was_at_rest=False)
-    problem = posed(recording, history=False)
-    [note] = notes(problem)
+    recording = make_recording(seed, was_at_rest=False)
+    problem = build_problem(recording, history=False)
+    [note] = list_notes(problem)
     assert note.startswith("8 samples read an input from before the record")
     assert "of its standard errors away" in note
     assert note.endswith("or skip: 8")
-    assert notes(posed(recording, history=True)) == []
-    assert notes(posed(recording, history=False, skip=8)) == []
+    assert list_notes(build_problem(recording, history=True)) == []
+    assert list_notes(build_problem(recording, history=False, skip=8)) == []
 
 
 def test_what_is_told_is_what_estimation_without_these_samples_gives() -> None:
-    recording = recorded(1, was_at_rest=False)
-    [note] = notes(posed(recording, history=False))
-    without = {e.name: e.value for e in analysed(posed(recording, history=False, skip=8)).estimates}
-    whole = {e.name: e.value for e in analysed(posed(recording, history=False)).estimates}
+    recording = make_recording(1, was_at_rest=False)
+    [note] = list_notes(build_problem(recording, history=False))
+    without = {
+        e.name: e.value
+        for e in analyse_problem(build_problem(recording, history=False, skip=8)).estimates
+    }
+    whole = {
+        e.name: e.value for e in analyse_problem(build_problem(recording, history=False)).estimates
+    }
     told = [name for name in ("K", "T", "L") if f"{name} is " in note]
     assert told
     for name in told:
@@ -85,13 +92,15 @@ def test_what_is_told_is_what_estimation_without_these_samples_gives() -> None:
 def test_of_a_record_that_begins_at_rest_nothing_is_told() -> None:
     """The guess is right, so the first samples fit the others: 20 draws, none warned of."""
     for seed in range(20):
-        assert notes(posed(recorded(seed, was_at_rest=True), history=False)) == []
+        assert (
+            list_notes(build_problem(make_recording(seed, was_at_rest=True), history=False)) == []
+        )
 
 
 def test_samples_that_read_an_assumed_input_end_with_the_estimated_lag() -> None:
-    recording = recorded(0, was_at_rest=True)
-    problem = posed(recording, history=False)
-    [part] = find_assumed_samples(problem, analysed(problem))
+    recording = make_recording(0, was_at_rest=True)
+    problem = build_problem(recording, history=False)
+    [part] = find_assumed_samples(problem, analyse_problem(problem))
     assert np.flatnonzero(part).tolist() == list(range(8))  # 0.7 s lies before L = 0.73 s
     short = derive_recording(
         recording, [{"trim": {"rows": [CUT - 4, CUT + 300], "history": False}}]
@@ -100,21 +109,21 @@ def test_samples_that_read_an_assumed_input_end_with_the_estimated_lag() -> None
         {"u": "u"}, {"y": "y"}
     )
     known = Problem.build(FOPDT, [record], parameters=BOUNDS)
-    [part] = find_assumed_samples(known, analysed(known))
+    [part] = find_assumed_samples(known, analyse_problem(known))
     assert np.count_nonzero(part) == 4
 
 
 def test_of_a_model_with_given_starts_nothing_is_told() -> None:
     """Left out or not, the samples that follow start where the guess has led to."""
-    recording = recorded(2, was_at_rest=False)
+    recording = make_recording(2, was_at_rest=False)
     start = float(recording.channel("y").values[CUT]) - TRUE["y0"]
     model = replace(FOPDT, initial=(FixedInitial(start),))
-    assert notes(posed(recording, history=False, model=model)) == []
+    assert list_notes(build_problem(recording, history=False, model=model)) == []
 
 
 def test_a_result_warns() -> None:
     part = derive_recording(
-        recorded(0, was_at_rest=False), [{"trim": {"rows": [CUT, 420], "history": False}}]
+        make_recording(0, was_at_rest=False), [{"trim": {"rows": [CUT, 420], "history": False}}]
     )
     record = part.to_record({"u": "u"}, {"y": "y"})
     found = identify(FOPDT, record, GeneticAlgorithm(generations=80), parameters=BOUNDS)

@@ -76,7 +76,7 @@ def test_one_step_ahead_estimates_of_an_unstable_plant_are_told(seed: int) -> No
     assert ahead.verdict.text == "trustworthy"
 
 
-def estimate(value: float, stderr: float) -> Estimate:
+def make_estimate(value: float, stderr: float) -> Estimate:
     interval = (value - 2 * stderr, value + 2 * stderr)
     return Estimate("a", "1/s", value, -1.0, 1.0, stderr, interval, "identified")
 
@@ -84,9 +84,9 @@ def estimate(value: float, stderr: float) -> Estimate:
 @pytest.mark.parametrize(
     ("free", "ahead", "status"),
     [
-        (estimate(0.17, 1e-4), estimate(0.20, 0.01), "prediction-dependent"),
-        (estimate(0.19, 1e-4), estimate(0.20, 0.01), "prediction-dependent"),
-        (estimate(0.17, 0.02), estimate(0.20, 0.01), "identified"),
+        (make_estimate(0.17, 1e-4), make_estimate(0.20, 0.01), "prediction-dependent"),
+        (make_estimate(0.19, 1e-4), make_estimate(0.20, 0.01), "prediction-dependent"),
+        (make_estimate(0.17, 0.02), make_estimate(0.20, 0.01), "identified"),
     ],
 )
 def test_only_a_value_outside_the_interval_of_the_free_run_contradicts_it(

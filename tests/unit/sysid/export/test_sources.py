@@ -11,7 +11,7 @@ from sysid.core.errors import InvalidSettings
 from sysid.export.identifiers import Identifiers
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
-from tests.exporting import in_control
+from tests.support.library.exported_programs import run_control
 
 VALUES = {"K": 1 / 3, "T": 0.1 + 0.2, "L": 2**-0.5, "y0": 1e-300, "x(0)": -1 / 7}
 
@@ -30,7 +30,7 @@ def test_values_are_exported_to_their_last_bit() -> None:
     assert list(defaults_of(python).values()) == expected
     c = sysid.export_model(load_model("fopdt"), VALUES, "c")
     assert [float(text) for text in re.findall(r"^    p\.\w+ = (.*);", c, re.M)] == expected
-    script = in_control(sysid.export_model(load_model("fopdt"), VALUES, "control"))
+    script = run_control(sysid.export_model(load_model("fopdt"), VALUES, "control"))
     [(numerator, _)] = script["pairs"].values()
     assert numerator[0][0] == VALUES["L"]
 

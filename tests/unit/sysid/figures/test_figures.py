@@ -30,7 +30,7 @@ from sysid.search.state import Improvement, IslandSummary
 from sysid.uncertainty.estimates import CorrelationMatrix, Estimate
 
 
-def island(points: int, start: float = 100.0) -> list[Improvement]:
+def make_island(points: int, start: float = 100.0) -> list[Improvement]:
     return [
         Improvement(n, 50 * n, start * 0.99**n, "sequence" if n % 5 == 4 else "genetic", (n / 10,))
         for n in range(points)
@@ -41,11 +41,11 @@ LAG = Estimate("L", "s", 0.1127, 0.0, 0.5, 0.0002, (0.1123, 0.1131), "identified
 CORRELATION = CorrelationMatrix(("T", "L"), np.array([[1.0, -0.7], [-0.7, 1.0]]))
 
 
-def islands(*reached: tuple[float, float | None]) -> list[IslandSummary]:
+def make_islands(*reached: tuple[float, float | None]) -> list[IslandSummary]:
     return [IslandSummary(champion, refined, (), 1) for champion, refined in reached]
 
 
-ISLANDS = islands((2.0, 1.1), (1.5, 1.0), (9.0, None))
+ISLANDS = make_islands((2.0, 1.1), (1.5, 1.0), (9.0, None))
 
 
 def run(**more: object) -> SearchTraces:
@@ -53,22 +53,22 @@ def run(**more: object) -> SearchTraces:
         "generations": 400,
         "parameters": [Parameter("L", 0.0, 0.5, "s")],
         "estimates": {"L": LAG},
-        "history": [island(30), island(20, 80.0)],
+        "history": [make_island(30), make_island(20, 80.0)],
         "epoch": 25,
         "migrations": [1, 2, 3],
     }
     return SearchTraces("kPa", **{**known, **more})  # type: ignore[arg-type]
 
 
-def signal(samples: int, name: str = "y") -> SignalTrace:
+def make_signal(samples: int, name: str = "y") -> SignalTrace:
     times = np.arange(samples) * 0.01
     return SignalTrace(name, "V", times, np.sin(times))
 
 
-def experiment(samples: int, since: float | None = None) -> ExperimentTraces:
-    measured = signal(samples)
+def make_experiment(samples: int, since: float | None = None) -> ExperimentTraces:
+    measured = make_signal(samples)
     outputs = (OutputTraces(measured, measured.values + 0.5),)
-    return ExperimentTraces("record 1", outputs, (signal(samples, "u"),), since)
+    return ExperimentTraces("record 1", outputs, (make_signal(samples, "u"),), since)
 
 
 def drawn(figure: plotly.Figure, name: str) -> dict[str, Any]:
@@ -112,7 +112,7 @@ def test_the_axis_of_a_number_without_dimension_names_no_unit() -> None:
 def test_digits_of_a_log_axis_do_not_lie_upon_each_other(
     smallest: float, digits: str | None
 ) -> None:
-    reached = islands((1.0, None), (1.0, smallest))
+    reached = make_islands((1.0, None), (1.0, smallest))
     axis = plotly.plot_waterfall(reached, "kPa")["layout"]["yaxis"]
     assert axis.get("dtick") == digits
 
@@ -141,7 +141,7 @@ def test_migrations_stand_at_the_end_of_their_epochs() -> None:
 
 @pytest.mark.parametrize("points", [999, 1000, 1001, 50_000])
 def test_no_line_of_a_history_or_convergence_has_over_a_thousand_points(points: int) -> None:
-    evidence = run(history=[island(points)], generations=10 * points)
+    evidence = run(history=[make_island(points)], generations=10 * points)
     for figure in (plotly.plot_history(evidence), plotly.plot_convergence(evidence)):
         assert all(len(trace["x"]) <= MAX_POINTS for trace in figure["data"])
 
@@ -186,28 +186,28 @@ def test_the_waterfall_puts_the_best_island_first() -> None:
 
 
 def test_a_response_shows_measured_minus_identified_as_residual() -> None:
-    figure = signals.plot_response(experiment(50))
+    figure = signals.plot_response(make_experiment(50))
     assert drawn(figure, "residual")["y"] == [-0.5] * 50
 
 
 def test_every_row_of_a_response_has_the_same_time_axis() -> None:
-    figure = signals.plot_response(experiment(50))
+    figure = signals.plot_response(make_experiment(50))
     assert all("xaxis" not in trace for trace in figure["data"])
     assert {trace["yaxis"] for trace in figure["data"]} == {"y", "y2", "y3"}
 
 
 def test_validation_is_shaded_from_its_first_sample_to_the_last() -> None:
-    shape = signals.plot_response(experiment(100, since=0.7))["layout"]["shapes"][0]
+    shape = signals.plot_response(make_experiment(100, since=0.7))["layout"]["shapes"][0]
     assert (shape["x0"], shape["x1"]) == (0.7, 0.99)
 
 
 def test_a_record_kept_for_validation_is_shaded_from_its_start() -> None:
-    shape = signals.plot_response(experiment(100, since=-math.inf))["layout"]["shapes"][0]
+    shape = signals.plot_response(make_experiment(100, since=-math.inf))["layout"]["shapes"][0]
     assert shape["x0"] == 0.0
 
 
 def before_record(name: str, known: SignalTrace) -> ExperimentTraces:
-    return replace(experiment(100), inputs=(replace(signal(100, name), history=known),))
+    return replace(make_experiment(100), inputs=(replace(make_signal(100, name), history=known),))
 
 
 def test_what_an_input_was_before_the_record_is_dotted_as_far_as_a_tenth_of_it() -> None:
@@ -219,12 +219,12 @@ def test_what_an_input_was_before_the_record_is_dotted_as_far_as_a_tenth_of_it()
     assert trace["line"]["dash"] == "dot"  # type: ignore[index]
     whole = drawn(signals.plot_signals(record.inputs), "u, before the record")
     assert whole["x"] == pytest.approx(times)
-    names = [one["name"] for one in signals.plot_response(experiment(100))["data"]]
+    names = [one["name"] for one in signals.plot_response(make_experiment(100))["data"]]
     assert not any("before the record" in name for name in names)
 
 
 def test_a_long_response_is_thinned_and_a_stretch_of_it_is_not() -> None:
-    record = experiment(20_000)
+    record = make_experiment(20_000)
     whole = signals.plot_response(record)
     part = signals.plot_response(record, 50.0, 53.0)
     assert all(len(trace["x"]) <= MAX_POINTS for trace in whole["data"])
@@ -241,8 +241,10 @@ def test_pooled_samples_are_drawn_as_points() -> None:
 
 
 def test_the_heights_that_a_page_reserves_are_those_of_the_figures() -> None:
-    assert signals.plot_response(experiment(9))["layout"]["height"] == signals.response_height(1, 1)
-    assert signals.plot_signals([signal(9), signal(9)])["layout"][
+    assert signals.plot_response(make_experiment(9))["layout"]["height"] == signals.response_height(
+        1, 1
+    )
+    assert signals.plot_signals([make_signal(9), make_signal(9)])["layout"][
         "height"
     ] == signals.signals_height(2)
     assert plotly.plot_convergence(run(), 3)["layout"]["height"] == plotly.convergence_height(1, 3)
@@ -250,11 +252,11 @@ def test_the_heights_that_a_page_reserves_are_those_of_the_figures() -> None:
 
 
 def test_the_numbers_of_a_figure_are_one_row_each_in_csv() -> None:
-    lines = to_csv(signals.plot_signals([signal(3, "a,b")])).splitlines()
+    lines = to_csv(signals.plot_signals([make_signal(3, "a,b")])).splitlines()
     assert lines[0] == "series,x,y"
     assert lines[1:3] == ['"a,b",0.0,0.0', '"a,b",0.01,0.009999833']
     assert to_csv(plotly.plot_correlation(CORRELATION)).splitlines()[2] == ",L,T,-0.7"
-    line = to_csv(signals.plot_signals([signal(3, "=1+1")])).splitlines()[1]
+    line = to_csv(signals.plot_signals([make_signal(3, "=1+1")])).splitlines()[1]
     assert line.startswith("'=1+1")  # no formula in a spreadsheet
 
 

@@ -22,7 +22,7 @@ from sysid.uncertainty.estimates import (
 )
 
 
-def corner(
+def make_corner(
     name: str, samples: Floats, stderr: float | None = 1.0, bounds: tuple[float, float] = (-9, 9)
 ) -> Corner:
     low, middle, high = np.quantile(samples, [0.025, 0.5, 0.975])
@@ -45,7 +45,7 @@ def plot(corners: list[Corner], correlation: Floats) -> Figure:
 
 def draw(count: int, n: int = 1000) -> list[Corner]:
     values = np.random.default_rng(1).standard_normal((count, n))
-    return [corner(f"p{i}", row) for i, row in enumerate(values)]
+    return [make_corner(f"p{i}", row) for i, row in enumerate(values)]
 
 
 def test_a_corner_has_a_histogram_of_each_and_a_cell_of_each_pair() -> None:
@@ -80,7 +80,7 @@ def test_the_region_holds_95_percent_of_the_samples() -> None:
 
 def test_the_region_ends_at_the_bounds() -> None:
     samples = np.abs(np.random.default_rng(1).standard_normal(500))
-    x, _, _, _ = estimate_region(corner("L", samples, bounds=(0.0, 9.0)), *draw(1, 500))
+    x, _, _, _ = estimate_region(make_corner("L", samples, bounds=(0.0, 9.0)), *draw(1, 500))
     assert x[0] == 0.0
 
 
@@ -88,7 +88,7 @@ def test_a_parameter_without_standard_error_has_no_ellipse() -> None:
     first, second = draw(2)
     names = {trace["name"] for trace in plot([first, second], np.eye(2))["data"]}
     assert "95 % ellipse of the standard errors" in names
-    bare = corner("p1", second.samples, None)
+    bare = make_corner("p1", second.samples, None)
     names = {trace["name"] for trace in plot([first, bare], np.eye(2))["data"]}
     assert "95 % ellipse of the standard errors" not in names
 
@@ -102,7 +102,7 @@ def test_the_ellipse_has_the_correlation_of_the_estimates() -> None:
 
 def test_of_many_parameters_the_most_correlated_are_shown_in_their_order() -> None:
     many = draw(MAX_SHOWN + 2)
-    many[3] = corner("p3", -many[7].samples + 0.1 * many[3].samples)
+    many[3] = make_corner("p3", -many[7].samples + 0.1 * many[3].samples)
     shown = choose_shown(many)
     assert len(shown) == MAX_SHOWN
     assert {3, 7} <= set(shown)
@@ -112,7 +112,7 @@ def test_of_many_parameters_the_most_correlated_are_shown_in_their_order() -> No
 
 
 def test_samples_that_are_all_equal_are_drawn_without_a_region() -> None:
-    figure = plot([corner("p0", np.ones(50)), *draw(1, 50)], np.eye(2))
+    figure = plot([make_corner("p0", np.ones(50)), *draw(1, 50)], np.eye(2))
     assert not any(trace["type"] == "contour" for trace in figure["data"])
 
 

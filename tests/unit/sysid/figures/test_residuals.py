@@ -19,7 +19,7 @@ from sysid.residuals.residual_tests import ResidualTest, ResidualTests
 from sysid.results.parts import OrderComparison, OrderFit
 
 
-def trace(
+def make_trace(
     *, is_auto: bool = True, period: float | None = 0.1, spike: float = 0.0
 ) -> CorrelationTrace:
     lags = np.arange(0.0 if is_auto else -25.0, 26.0)
@@ -36,7 +36,7 @@ def bars(figure: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def test_every_function_is_drawn_over_its_bands_and_lag_0_of_an_autocorrelation_is_not() -> None:
-    figure = plot_residuals([trace(), trace(is_auto=False)])
+    figure = plot_residuals([make_trace(), make_trace(is_auto=False)])
     first, second = bars(figure)
     assert first["x"] == list(range(1, 26))
     assert second["x"] == list(range(-25, 26))
@@ -46,7 +46,7 @@ def test_every_function_is_drawn_over_its_bands_and_lag_0_of_an_autocorrelation_
 
 
 def test_a_lag_outside_the_band_has_another_colour_and_stays_in_sight() -> None:
-    figure = plot_residuals([trace(spike=0.4)])
+    figure = plot_residuals([make_trace(spike=0.4)])
     colours = bars(figure)[0]["marker"]["color"]
     assert len(set(colours)) == 2
     assert colours.count(colours[-3]) == 1
@@ -56,7 +56,7 @@ def test_a_lag_outside_the_band_has_another_colour_and_stays_in_sight() -> None:
 @pytest.mark.parametrize("count", [1, 2, 3, 7])
 @pytest.mark.parametrize("columns", [1, 2])
 def test_the_plots_lie_inside_the_figure_and_apart(count: int, columns: int) -> None:
-    figure = plot_residuals([trace()] * count, columns)
+    figure = plot_residuals([make_trace()] * count, columns)
     shown = figure["layout"]
     assert shown["height"] == residuals_height(count, columns)
     axes = [str(k) if k > 1 else "" for k in range(1, count + 1)]
@@ -72,15 +72,16 @@ def test_without_functions_there_is_nothing_to_draw() -> None:
 
 
 def test_the_axis_says_what_a_lag_is() -> None:
-    title = plot_residuals([trace()])["layout"]["xaxis"]["title"]["text"]
+    title = plot_residuals([make_trace()])["layout"]["xaxis"]["title"]["text"]
     assert title == "lag [samples of 0.1 s]"
     assert (
-        plot_residuals([trace(period=None)])["layout"]["xaxis"]["title"]["text"] == "lag [samples]"
+        plot_residuals([make_trace(period=None)])["layout"]["xaxis"]["title"]["text"]
+        == "lag [samples]"
     )
 
 
 def test_the_figure_is_json_and_its_numbers_are_csv() -> None:
-    figure = plot_residuals([trace(), trace(is_auto=False)])
+    figure = plot_residuals([make_trace(), make_trace(is_auto=False)])
     json.dumps(figure, allow_nan=False)
     rows = to_csv(figure).splitlines()
     assert rows[0] == "series,x,y"

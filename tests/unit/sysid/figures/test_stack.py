@@ -23,14 +23,14 @@ from sysid.uncertainty.estimates import CorrelationMatrix
 T = np.linspace(0.0, 1.0, 30)
 
 
-def response() -> Figure:
+def compute_response() -> Figure:
     output = OutputTraces(SignalTrace("y", "bar", T, T), T + 0.1)
     return plot_response(
         ExperimentTraces("one", (output,), (SignalTrace("u", "1", T, T),), validation_from=0.7)
     )
 
 
-def residuals() -> Figure:
+def compute_residuals() -> Figure:
     band = np.full(9, 0.2)
     lags = np.arange(9.0)
     one = CorrelationTrace("white: passed", True, 0.1, lags, 0.1 * np.cos(lags), band, 1.3 * band)
@@ -43,8 +43,8 @@ CORRELATION = CorrelationMatrix(("K", "T"), np.eye(2))
 
 def parts() -> list[tuple[str, Figure]]:
     return [
-        ("Response", response()),
-        ("Residuals", residuals()),
+        ("Response", compute_response()),
+        ("Residuals", compute_residuals()),
         ("Correlation", plotly.plot_correlation(CORRELATION)),
         ("Waterfall", plotly.plot_waterfall(ISLANDS, "bar")),
     ]
@@ -88,7 +88,7 @@ def test_parts_follow_one_another_without_overlap() -> None:
 def test_every_plot_keeps_its_height() -> None:
     stacked = stack_figures(parts())["layout"]
     assert stacked["height"] > sum(figure["layout"]["height"] for _, figure in parts())
-    alone = response()["layout"]
+    alone = compute_response()["layout"]
     margin = alone["margin"]
     room = alone["height"] - margin["t"] - margin["b"]
     for name in ("yaxis", "yaxis2", "yaxis3"):

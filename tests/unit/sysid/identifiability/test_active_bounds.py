@@ -26,7 +26,7 @@ def space(number: int) -> tuple[Parameter, ...]:
     return tuple(Parameter(name, 0.0, 1.0) for name in "abcd"[:number])
 
 
-def advised(
+def find_advice(
     columns: FloatArray, truth: FloatArray, place: FloatArray, reaches: Any = None
 ) -> tuple[tuple[ActiveBound, ...], list[str]]:
     """Advice at the best place inside the bounds for data of a linear model, and who is pulled."""
@@ -40,21 +40,21 @@ def advised(
 def test_a_bound_that_only_stands_in_for_another_is_not_to_be_widened() -> None:
     """b lies at its upper bound because a is held: once a is free, b belongs inside."""
     columns = np.column_stack([A, 0.9 * A + 0.4 * B])
-    found, alone = advised(columns, np.array([3.0, 0.5]), np.array([1.0, 1.0]))
+    found, alone = find_advice(columns, np.array([3.0, 0.5]), np.array([1.0, 1.0]))
     assert alone == ["a", "b"]
     assert [(one.name, one.side) for one in found] == [("a", "upper")]
 
 
 def test_of_two_with_one_effect_one_is_widened() -> None:
     columns = np.column_stack([A, A])
-    found, alone = advised(columns, np.array([2.0, 2.0]), np.array([1.0, 1.0]))
+    found, alone = find_advice(columns, np.array([2.0, 2.0]), np.array([1.0, 1.0]))
     assert alone == ["a", "b"]
     assert [one.name for one in found] == ["a"]
 
 
 def test_bounds_that_hold_back_both_are_both_told_the_costliest_first() -> None:
     columns = np.column_stack([A, B])
-    found, _ = advised(columns, np.array([-1.0, 4.0]), np.array([0.0, 1.0]))
+    found, _ = find_advice(columns, np.array([-1.0, 4.0]), np.array([0.0, 1.0]))
     assert [(one.name, one.side) for one in found] == [("b", "upper"), ("a", "lower")]
     assert found[0].share + found[1].share == pytest.approx(1.0, abs=1e-4)
 
@@ -63,7 +63,7 @@ def test_what_cannot_move_outwards_leaves_it_to_those_that_can() -> None:
     """a is wanted below what is possible: b, of nearly the same effect, takes its part."""
     columns = np.column_stack([A, A + 0.3 * B])
     reaches = ((0.0, np.inf), ANYWHERE)
-    found, alone = advised(columns, np.array([-2.0, -1.0]), np.array([0.0, 0.0]), reaches)
+    found, alone = find_advice(columns, np.array([-2.0, -1.0]), np.array([0.0, 0.0]), reaches)
     assert alone == ["a", "b"]
     assert [one.name for one in found] == ["b"]
 
@@ -71,13 +71,13 @@ def test_what_cannot_move_outwards_leaves_it_to_those_that_can() -> None:
 def test_the_step_goes_no_farther_than_is_possible() -> None:
     columns = np.column_stack([A, B])
     reaches = ((-0.5, 2.0), ANYWHERE)
-    [only], _ = advised(columns, np.array([-4.0, 0.5]), np.array([0.0, 0.5]), reaches)
+    [only], _ = find_advice(columns, np.array([-4.0, 0.5]), np.array([0.0, 0.5]), reaches)
     assert (only.name, only.limit) == ("a", -0.5)
     assert only.share == pytest.approx(1 - (3.5 / 4) ** 2, abs=0.01)
     assert only.advice == "lower the bound of a, to -0.5 at the least"
 
 
-def lag(**bounds: Any) -> Model:
+def build_lag(**bounds: Any) -> Model:
     """First-order lag behind a dead time."""
     parameters = {
         "K": {"lower": 0.1, "upper": 5},
@@ -100,7 +100,7 @@ def lag(**bounds: Any) -> Model:
     )
 
 
-def problem(model: Model, ahead: float = 0.0, **truth: float) -> Problem:
+def build_problem(model: Model, ahead: float = 0.0, **truth: float) -> Problem:
     """Data of a lag; `ahead`: the output is recorded so much too early."""
     values = {"K": 2.0, "T": 0.6, "L": 0.3} | truth
     y = simulate(model, [U], values, times=TIMES).channel("y").values
@@ -110,29 +110,31 @@ def problem(model: Model, ahead: float = 0.0, **truth: float) -> Problem:
 
 
 def test_a_lag_at_zero_is_not_to_be_negative() -> None:
-    found = analyse_estimate(problem(lag(), ahead=0.25, L=0.0, T=1.0), np.array([2.0, 1.0, 0.0]))
+    found = analyse_estimate(
+        build_problem(build_lag(), ahead=0.25, L=0.0, T=1.0), np.array([2.0, 1.0, 0.0])
+    )
     assert found.estimates[2].status == "at bound"
     assert "L" not in [one.name for one in found.active_bounds]
 
 
 def test_a_lag_that_is_held_above_zero_may_go_down_to_it() -> None:
-    model = lag(L={"lower": 0.5, "upper": 1.0})
-    found = analyse_estimate(problem(model, L=0.1), np.array([2.0, 0.6, 0.5]))
+    model = build_lag(L={"lower": 0.5, "upper": 1.0})
+    found = analyse_estimate(build_problem(model, L=0.1), np.array([2.0, 0.6, 0.5]))
     [only] = [one for one in found.active_bounds if one.name == "L"]
     assert (only.side, only.limit) == ("lower", 0.0)
     assert only.advice == "lower the bound of L, to 0 s at the least"
 
 
 def test_a_time_constant_is_not_to_be_negative_nor_zero_to_be_passed() -> None:
-    changed = problem(lag(T={"lower": 0.5}))
+    changed = build_problem(build_lag(T={"lower": 0.5}))
     assert find_widest_bounds(changed, changed.free_parameters[1]) == (0.0, np.inf)
-    logarithmic = problem(lag(K={"scale": "log"}))
+    logarithmic = build_problem(build_lag(K={"scale": "log"}))
     assert find_widest_bounds(logarithmic, logarithmic.free_parameters[0]) == (0.0, np.inf)
     assert find_widest_bounds(changed, changed.free_parameters[0]) == (-np.inf, np.inf)
 
 
 def test_a_lag_is_not_to_reach_as_far_back_as_the_record() -> None:
-    short = problem(lag())
+    short = build_problem(build_lag())
     low, high = find_widest_bounds(short, short.free_parameters[2])
     assert low == 0.0
     assert high == pytest.approx(TIMES[-1], rel=1e-6)

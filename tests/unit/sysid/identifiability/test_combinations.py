@@ -13,12 +13,12 @@ from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
-from tests import catalogue_cases
+from tests.support.library import catalogue_cases
 
 STEP = 0.05
 
 
-def document(
+def build_document(
     equations: dict[str, str],
     parameters: tuple[str, ...],
     form: str = "differential",
@@ -37,7 +37,7 @@ def document(
     return written | fields
 
 
-def posed(
+def build_problem(
     written: dict[str, Any], truth: dict[str, float], sd: float = 0.01, n: int = 200, **options: Any
 ) -> tuple[Problem, FloatArray]:
     """A problem whose data are the model's at the truth, with noise."""
@@ -53,35 +53,35 @@ def posed(
     return Problem.build(model, [data], **options), theta
 
 
-def told(analysis: Analysis) -> dict[str, IdentifiableCombination]:
+def list_groups(analysis: Analysis) -> dict[str, IdentifiableCombination]:
     assert analysis.uncertainty is not None
     return {group.expression: group for group in analysis.uncertainty.groups}
 
 
-def statuses(analysis: Analysis) -> dict[str, str]:
+def list_statuses(analysis: Analysis) -> dict[str, str]:
     return {estimate.name: estimate.status for estimate in analysis.estimates}
 
 
-ARM = document({"x": "v", "v": "(A*k*u - B*v - c*x)/J"}, ("J", "A", "k", "B", "c"))
+ARM = build_document({"x": "v", "v": "(A*k*u - B*v - c*x)/J"}, ("J", "A", "k", "B", "c"))
 TRUTH = {"J": 2.0, "A": 3.0, "k": 1.5, "B": 4.0, "c": 5.0}
 
 
 def test_products_of_powers_are_written_out_with_value_and_standard_error() -> None:
-    problem, theta = posed(ARM, TRUTH)
+    problem, theta = build_problem(ARM, TRUTH)
     analysis = analyse_estimate(problem, theta)
-    groups = told(analysis)
+    groups = list_groups(analysis)
     assert set(groups) == {"A*k/J", "B/J", "c/J"}
     assert groups["A*k/J"].members == ("J", "A", "k")
     assert groups["A*k/J"].value == pytest.approx(2.25)
-    assert set(statuses(analysis).values()) == {"group"}
+    assert set(list_statuses(analysis).values()) == {"group"}
     assert all(e.stderr is None and "B/J" in e.reason for e in analysis.estimates if e.name == "B")
 
 
 def test_the_standard_error_of_a_group_is_that_of_the_parameter_in_its_place() -> None:
-    problem, theta = posed(ARM, TRUTH)
-    groups = told(analyse_estimate(problem, theta))
+    problem, theta = build_problem(ARM, TRUTH)
+    groups = list_groups(analyse_estimate(problem, theta))
     given = {"J": {"fixed": 2.0}, "k": {"fixed": 1.5}}
-    known, part = posed(ARM, TRUTH, parameters=given)
+    known, part = build_problem(ARM, TRUTH, parameters=given)
     alone = {e.name: e for e in analyse_estimate(known, part).estimates}
     for name, expression, factor in (("A", "A*k/J", 1.5 / 2), ("B", "B/J", 0.5), ("c", "c/J", 0.5)):
         assert alone[name].status == "identified"
@@ -92,40 +92,42 @@ def test_the_standard_error_of_a_group_is_that_of_the_parameter_in_its_place() -
 
 
 def test_a_sum_is_written_as_a_sum() -> None:
-    written = document({"x": "(a + b)*u - 2*c*x"}, ("a", "b", "c"))
-    problem, theta = posed(written, {"a": 0.7, "b": 2.3, "c": 1.1})
+    written = build_document({"x": "(a + b)*u - 2*c*x"}, ("a", "b", "c"))
+    problem, theta = build_problem(written, {"a": 0.7, "b": 2.3, "c": 1.1})
     analysis = analyse_estimate(problem, theta)
-    assert statuses(analysis) == {"a": "group", "b": "group", "c": "identified"}
-    assert [(g, v.value) for g, v in told(analysis).items()] == [("a + b", pytest.approx(3.0))]
+    assert list_statuses(analysis) == {"a": "group", "b": "group", "c": "identified"}
+    assert [(g, v.value) for g, v in list_groups(analysis).items()] == [
+        ("a + b", pytest.approx(3.0))
+    ]
 
 
 def test_a_combination_that_is_neither_is_told_with_numbers() -> None:
-    written = document({"x": "(a + sin(b))*u - c*x"}, ("a", "b", "c"))
-    problem, theta = posed(written, {"a": 0.7, "b": 0.3, "c": 1.1})
+    written = build_document({"x": "(a + sin(b))*u - c*x"}, ("a", "b", "c"))
+    problem, theta = build_problem(written, {"a": 0.7, "b": 0.3, "c": 1.1})
     analysis = analyse_estimate(problem, theta)
-    [(text, group)] = told(analysis).items()
+    [(text, group)] = list_groups(analysis).items()
     assert text == "a + 0.9553*b"  # cos(0.3)
     assert group.is_local
     assert analysis.estimates[0].reason.endswith(": a + 0.9553*b (near the estimate)")
 
 
 def test_a_combination_that_holds_everywhere_is_not_said_to_hold_near_the_estimate() -> None:
-    problem, theta = posed(ARM, TRUTH)
+    problem, theta = build_problem(ARM, TRUTH)
     analysis = analyse_estimate(problem, theta)
-    assert not any(group.is_local for group in told(analysis).values())
+    assert not any(group.is_local for group in list_groups(analysis).values())
     assert not any("near the estimate" in estimate.reason for estimate in analysis.estimates)
 
 
 def test_groups_that_have_no_parameter_in_common_are_told_apart() -> None:
-    written = document({"x": "a*b*u - c*d*x"}, ("a", "b", "c", "d"))
-    problem, theta = posed(written, {"a": 0.7, "b": 2.3, "c": 1.1, "d": 0.9})
-    assert set(told(analyse_estimate(problem, theta))) == {"a*b", "c*d"}
+    written = build_document({"x": "a*b*u - c*d*x"}, ("a", "b", "c", "d"))
+    problem, theta = build_problem(written, {"a": 0.7, "b": 2.3, "c": 1.1, "d": 0.9})
+    assert set(list_groups(analyse_estimate(problem, theta))) == {"a*b", "c*d"}
 
 
 def test_powers_other_than_one_are_written() -> None:
-    written = document({"x": "a*sqrt(b)*u - c*x"}, ("a", "b", "c"))
-    problem, theta = posed(written, {"a": 0.7, "b": 2.3, "c": 1.1})
-    assert set(told(analyse_estimate(problem, theta))) == {"a**2*b"}
+    written = build_document({"x": "a*sqrt(b)*u - c*x"}, ("a", "b", "c"))
+    problem, theta = build_problem(written, {"a": 0.7, "b": 2.3, "c": 1.1})
+    assert set(list_groups(analyse_estimate(problem, theta))) == {"a**2*b"}
 
 
 @pytest.mark.parametrize(
@@ -140,10 +142,10 @@ def test_powers_other_than_one_are_written() -> None:
 def test_a_power_of_a_negative_estimate_is_written_only_where_it_is_a_number(
     form: str, a: float, text: str
 ) -> None:
-    written = document({"x": f"{form}*u - c*x"}, ("a", "b", "c"))
+    written = build_document({"x": f"{form}*u - c*x"}, ("a", "b", "c"))
     written["parameters"]["a"] = {"lower": -2, "upper": 2}
-    problem, theta = posed(written, {"a": a, "b": 2.3, "c": 1.1})
-    ((found, group),) = told(analyse_estimate(problem, theta)).items()
+    problem, theta = build_problem(written, {"a": a, "b": 2.3, "c": 1.1})
+    ((found, group),) = list_groups(analyse_estimate(problem, theta)).items()
     assert found == text
     assert np.isfinite(group.value)
     assert group.stderr is not None
@@ -151,19 +153,19 @@ def test_a_power_of_a_negative_estimate_is_written_only_where_it_is_a_number(
 
 
 def test_a_parameter_without_effect_belongs_to_no_group() -> None:
-    written = document({"x": "a*u - c*x + 0*d"}, ("a", "c", "d"))
-    problem, theta = posed(written, {"a": 0.7, "c": 1.1, "d": 2.0})
+    written = build_document({"x": "a*u - c*x + 0*d"}, ("a", "c", "d"))
+    problem, theta = build_problem(written, {"a": 0.7, "c": 1.1, "d": 2.0})
     analysis = analyse_estimate(problem, theta)
-    assert statuses(analysis)["d"] == "unidentifiable"
-    assert told(analysis) == {}
+    assert list_statuses(analysis)["d"] == "unidentifiable"
+    assert list_groups(analysis) == {}
 
 
 def test_what_the_data_tell_little_of_is_a_group_with_a_standard_error() -> None:
-    written = document({"x": "(a + b)*u + 0.0001*b - c*x"}, ("a", "b", "c"))
-    problem, theta = posed(written, {"a": 0.7, "b": 2.3, "c": 1.1})
+    written = build_document({"x": "(a + b)*u + 0.0001*b - c*x"}, ("a", "b", "c"))
+    problem, theta = build_problem(written, {"a": 0.7, "b": 2.3, "c": 1.1})
     analysis = analyse_estimate(problem, theta)
-    assert statuses(analysis) == {"a": "group", "b": "group", "c": "identified"}
-    (group,) = told(analysis).values()
+    assert list_statuses(analysis) == {"a": "group", "b": "group", "c": "identified"}
+    (group,) = list_groups(analysis).values()
     assert group.value == pytest.approx(3.0, rel=0.01)
     assert group.stderr is not None
     assert group.stderr < 0.05
@@ -190,14 +192,14 @@ def test_what_the_data_tell_little_of_is_a_group_with_a_standard_error() -> None
 def test_the_rank_follows_from_the_form_of_the_equation(
     equation: str, names: str, rank: int
 ) -> None:
-    written = document({"x": equation}, tuple(names))
+    written = build_document({"x": equation}, tuple(names))
     written["parameters"] = {name: {"lower": 0.1, "upper": 3} for name in names}
     model = parse_model(written)
     assert len(names) - find_scalings(model, model.parameters).shape[0] == rank
 
 
 def test_a_scaling_leaves_the_output_as_it_is() -> None:
-    problem, theta = posed(ARM, TRUTH)
+    problem, theta = build_problem(ARM, TRUTH)
     for powers in find_scalings(problem.model, problem.all_parameters):
         scaled = theta * 1.3**powers
         np.testing.assert_allclose(
@@ -207,14 +209,14 @@ def test_a_scaling_leaves_the_output_as_it_is() -> None:
 
 def test_a_state_that_starts_elsewhere_than_at_zero_has_its_scale() -> None:
     equations = {"y": "a*z - y", "z": "b*u - z"}
-    free = parse_model(document(equations, ("a", "b")))
-    bound = parse_model(document(equations, ("a", "b"), initial={"y": 0, "z": 1}))
+    free = parse_model(build_document(equations, ("a", "b")))
+    bound = parse_model(build_document(equations, ("a", "b"), initial={"y": 0, "z": 1}))
     assert find_scalings(free, free.parameters).tolist() == [[1.0, -1.0]]
     assert find_scalings(bound, bound.parameters).size == 0
 
 
 def test_a_fixed_parameter_is_no_part_of_a_scaling() -> None:
-    problem, _ = posed(ARM, TRUTH, parameters={"J": {"fixed": 2.0}})
+    problem, _ = build_problem(ARM, TRUTH, parameters={"J": {"fixed": 2.0}})
     assert find_scalings(problem.model, problem.all_parameters).tolist() == [[1.0, -1.0, 0.0, 0.0]]
 
 
@@ -240,9 +242,9 @@ def test_of_the_eight_parameters_of_the_actuator_six_combinations_can_be_found()
     y = problem.predict(theta[None])[0] + 1e-3 * rng.standard_normal(800)
     measured = replace_output(blank, np.concatenate([[0.0], y[1:]]))
     analysis = analyse_estimate(Problem.build(model, [measured], parameters=FREE), theta)
-    groups = told(analysis)
+    groups = list_groups(analysis)
     assert set(groups) == {"B/J", "F_c/J", "F_max/J", "k_b*A_m/J", "k_c*A_m/J"}
-    assert statuses(analysis)["k_a"] == "identified"
+    assert list_statuses(analysis)["k_a"] == "identified"
     assert analysis.uncertainty is not None
     assert np.sum(analysis.uncertainty.singular_values > 1e-10) == 6
     relative = {name: (g.stderr or 0.0) / g.value for name, g in groups.items()}
@@ -257,19 +259,19 @@ def replace_output(record: Record, values: FloatArray) -> Record:
 
 def test_a_factor_of_a_sum_is_small_or_not_by_what_it_makes_of_it() -> None:
     """Of a parameter in the thousands a factor of 1/2000 counts."""
-    written = document({"x": "(sin(a) + b/2000)*u - c*x"}, ("a", "b", "c"))
+    written = build_document({"x": "(sin(a) + b/2000)*u - c*x"}, ("a", "b", "c"))
     written["parameters"]["b"] = {"lower": 1, "upper": 5000}
-    problem, theta = posed(written, {"a": 0.3, "b": 1000.0, "c": 1.1})
-    (group,) = told(analyse_estimate(problem, theta)).values()
+    problem, theta = build_problem(written, {"a": 0.3, "b": 1000.0, "c": 1.1})
+    (group,) = list_groups(analyse_estimate(problem, theta)).values()
     assert group.members == ("a", "b")
     assert group.value == pytest.approx(0.3 + 1000 / 2000 / np.cos(0.3), rel=1e-3)
 
 
 def test_where_a_factor_is_zero_the_other_has_no_effect_and_it_is_no_group() -> None:
-    written = document({"x": "a*b*u + 1 - c*x"}, ("a", "b", "c"))
+    written = build_document({"x": "a*b*u + 1 - c*x"}, ("a", "b", "c"))
     written["parameters"]["a"] = {"lower": 0, "upper": 2}
-    problem, theta = posed(written, {"a": 0.0, "b": 2.3, "c": 1.1})
+    problem, theta = build_problem(written, {"a": 0.0, "b": 2.3, "c": 1.1})
     analysis = analyse_estimate(problem, theta)
-    assert statuses(analysis) == {"a": "at bound", "b": "unidentifiable", "c": "identified"}
-    assert told(analysis) == {}
+    assert list_statuses(analysis) == {"a": "at bound", "b": "unidentifiable", "c": "identified"}
+    assert list_groups(analysis) == {}
     assert analysis.estimates[0].stderr is not None

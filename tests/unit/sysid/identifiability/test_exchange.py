@@ -50,7 +50,7 @@ TRUTH = {"K": 2.0, "L": 0.3, "T1": 1.5, "T2": 0.5}
 THETA = np.array(list(TRUTH.values()))
 
 
-def model(form: str, **bounds: dict[str, float]) -> Model:
+def build_model(form: str, **bounds: dict[str, float]) -> Model:
     parameters = {
         "K": {"lower": 0.1, "upper": 5, "unit": "m"},
         "L": {**SPAN, "upper": 1},
@@ -69,14 +69,14 @@ def model(form: str, **bounds: dict[str, float]) -> Model:
     )
 
 
-def recorded(form: str) -> Record:
-    clean = simulate(model(form), [U], TRUTH, times=TIMES).channels[0]
+def make_record(form: str) -> Record:
+    clean = simulate(build_model(form), [U], TRUTH, times=TIMES).channels[0]
     noise = np.random.default_rng(4).normal(0, 0.05, TIMES.size)
     return Record((U,), (Channel("z", TIMES, clean.values + noise, "m"),))
 
 
-def problem(form: str, **bounds: dict[str, float]) -> Problem:
-    return Problem.build(model(form, **bounds), [recorded(form)])
+def build_problem(form: str, **bounds: dict[str, float]) -> Problem:
+    return Problem.build(build_model(form, **bounds), [make_record(form)])
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def problem(form: str, **bounds: dict[str, float]) -> Problem:
 def test_an_exchange_is_found_whether_or_not_the_equations_show_it(
     form: str, expected: ExchangeGroups
 ) -> None:
-    found, spent = find_exchanges(problem(form), THETA)
+    found, spent = find_exchanges(build_problem(form), THETA)
     assert found == expected
     # The lag is no candidate, and the gain has another unit; what is found is looked at twice.
     assert spent == (5 if expected else 3)
@@ -96,18 +96,18 @@ def test_an_exchange_is_found_whether_or_not_the_equations_show_it(
 def test_what_is_known_as_a_product_or_a_sum_only_is_no_exchange(form: str) -> None:
     made = parse_model(
         {
-            **(model("symmetric").document or {}),
+            **(build_model("symmetric").document or {}),
             "states": {"x": "m"},
             "equations": {"x": form},
             "outputs": {"z": "x"},
             "initial": {"x": 0},
         }
     )
-    assert find_exchanges(Problem.build(made, [recorded("symmetric")]), THETA)[0] == ()
+    assert find_exchanges(Problem.build(made, [make_record("symmetric")]), THETA)[0] == ()
 
 
 def test_it_is_found_at_a_double_pole_too() -> None:
-    assert find_exchanges(problem("in series"), np.array([2.0, 0.3, 1.0, 1.0]))[0] == (
+    assert find_exchanges(build_problem("in series"), np.array([2.0, 0.3, 1.0, 1.0]))[0] == (
         ((2,), (3,)),
     )
 
@@ -130,12 +130,12 @@ def test_what_can_be_exchanged_at_this_estimate_only_is_none(
     gain = {"lower": -5, "upper": 5, "unit": "m"}
     made = parse_model(
         {
-            **(model("in series").document or {}),
+            **(build_model("in series").document or {}),
             **form,
             "parameters": {"K": gain, "M": gain, "T1": SPAN, "T2": SPAN},
         }
     )
-    found = find_exchanges(Problem.build(made, [recorded("in series")]), np.array(theta))[0]
+    found = find_exchanges(Problem.build(made, [make_record("in series")]), np.array(theta))[0]
     assert found == expected
 
 
@@ -145,17 +145,17 @@ def test_it_is_found_in_wide_bounds_where_the_middle_of_the_range_diverges(
     scale: str, second: float
 ) -> None:
     wide: dict[str, Any] = {"lower": 1e-3, "upper": 1e3, "scale": scale}
-    posed = problem("in series", T1=wide, T2=wide)
+    posed = build_problem("in series", T1=wide, T2=wide)
     assert find_exchanges(posed, np.array([2.0, 0.3, 1.5, second]))[0] == (((2,), (3,)),)
 
 
 def test_bounds_that_tell_which_is_which_leave_nothing_to_be_exchanged() -> None:
-    posed = problem("in series", T1={"lower": 1.0}, T2={"upper": 0.9})
+    posed = build_problem("in series", T1={"lower": 1.0}, T2={"upper": 0.9})
     assert find_exchanges(posed, THETA) == ((), 0)
 
 
 def test_a_budget_is_kept() -> None:
-    assert find_exchanges(problem("in series"), THETA, 4) == ((), 0)
+    assert find_exchanges(build_problem("in series"), THETA, 4) == ((), 0)
 
 
 def test_three_in_a_row_are_one_group() -> None:
@@ -201,10 +201,10 @@ def beside(
         "initial": dict.fromkeys(subsystems, START),
     }
     document["parameters"] |= changed
-    return Problem.build(parse_model(document), [recorded("in series")] * records)
+    return Problem.build(parse_model(document), [make_record("in series")] * records)
 
 
-def named(posed: Problem, found: ExchangeGroups) -> list[list[str]]:
+def name_units(posed: Problem, found: ExchangeGroups) -> list[list[str]]:
     return [
         [" ".join(posed.free_parameters[d].name for d in unit) for unit in one] for one in found
     ]
@@ -227,7 +227,7 @@ def drawn(posed: Problem, seed: int = 1) -> FloatArray:
 def test_sections_side_by_side_change_places_with_gains_and_starts(written: dict[str, str]) -> None:
     posed = beside(written=written)
     found, spent = find_exchanges(posed, drawn(posed))
-    assert named(posed, found) == [["Kx Tx x(0)", "Ky Ty y(0)"]]
+    assert name_units(posed, found) == [["Kx Tx x(0)", "Ky Ty y(0)"]]
     assert spent == 2 * 3 + 5  # a pair of gains, one of time constants; the sections
     [note] = describe_exchanges(posed, found, {"Tx", "Ty"})
     assert note.startswith("(Kx, Tx, x(0)) and (Ky, Ty, y(0)) can be exchanged as a whole")
@@ -275,11 +275,11 @@ def test_sums_of_names_that_fit_either_way_round_are_not_all_tried(
     posed = beside(written=written, **dict.fromkeys(names, SPAN))
     apart, looked_at = subsystems._split_expression, []
 
-    def counted(tree: Expression) -> Any:
+    def count_and_part(tree: Expression) -> Any:
         looked_at.append(tree)
         return apart(tree)
 
-    monkeypatch.setattr(subsystems, "_split_expression", counted)
+    monkeypatch.setattr(subsystems, "_split_expression", count_and_part)
     assert list(subsystems.find_equivalent_subsystems(posed)) == []
     assert len(looked_at) < 10_000
 
@@ -288,7 +288,7 @@ def test_three_sections_side_by_side_are_one_group_and_are_given_in_order() -> N
     posed = beside("xyw")
     theta = drawn(posed)
     found, spent = find_exchanges(posed, theta)
-    assert named(posed, found) == [["Kx Tx x(0)", "Ky Ty y(0)", "Kw Tw w(0)"]]
+    assert name_units(posed, found) == [["Kx Tx x(0)", "Ky Ty y(0)", "Kw Tw w(0)"]]
     assert spent <= 2 * 9 + 2 * 5
     after = order_exchangeable(posed, theta[None], found)[0]
     assert after[0] > after[1] > after[2]
@@ -299,7 +299,7 @@ def test_three_sections_side_by_side_are_one_group_and_are_given_in_order() -> N
 def test_each_experiment_has_starts_of_its_own() -> None:
     posed = beside(records=2)
     found, _ = find_exchanges(posed, drawn(posed))
-    assert named(posed, found) == [["Kx Tx x(0) x(0)[2]", "Ky Ty y(0) y(0)[2]"]]
+    assert name_units(posed, found) == [["Kx Tx x(0) x(0)[2]", "Ky Ty y(0) y(0)[2]"]]
 
 
 def test_sections_of_two_states_change_places_with_all_their_parameters() -> None:
@@ -315,15 +315,15 @@ def test_sections_of_two_states_change_places_with_all_their_parameters() -> Non
             "initial": {"a": 0, "v": START, "b": 0, "w": START},
         }
     )
-    posed = Problem.build(made, [recorded("in series")])
+    posed = Problem.build(made, [make_record("in series")])
     found, _ = find_exchanges(posed, np.array([3.0, 0.5, 1.0, 0.2, 0.4, -0.3]))
-    assert named(posed, found) == [["ka ca v(0)", "kb cb w(0)"]]
+    assert name_units(posed, found) == [["ka ca v(0)", "kb cb w(0)"]]
 
 
 def test_sections_that_begin_unlike_are_told_apart() -> None:
     document = dict(beside().model.document or {})
     made = parse_model({**document, "initial": {"x": 0, "y": 1}})
-    posed = Problem.build(made, [recorded("in series")])
+    posed = Problem.build(made, [make_record("in series")])
     assert find_exchanges(posed, drawn(posed))[0] == ()
 
 
@@ -435,7 +435,12 @@ def test_four_in_a_row_are_one_group_though_looked_at_together_first() -> None:
 
 def test_whatever_the_seed_the_larger_comes_first_and_it_is_told() -> None:
     found = [
-        identify(model("in series"), recorded("in series"), GeneticAlgorithm(islands=2), seed=seed)
+        identify(
+            build_model("in series"),
+            make_record("in series"),
+            GeneticAlgorithm(islands=2),
+            seed=seed,
+        )
         for seed in range(4)
     ]
     for one in found:
@@ -451,7 +456,7 @@ def test_whatever_the_seed_the_larger_comes_first_and_it_is_told() -> None:
 
 @pytest.mark.parametrize("name", ["T1", "T2"])
 def test_a_profile_stays_with_one_copy(name: str) -> None:
-    posed = problem("in series")
+    posed = build_problem("in series")
     found = compute_profile(posed, THETA, name, points=41)
     own = found.others[:, 2]  # the other time constant
     larger, smaller = (found.values, own) if name == "T1" else (own, found.values)
@@ -466,10 +471,10 @@ def test_a_profile_stays_with_one_copy(name: str) -> None:
 @pytest.mark.parametrize("name", ["T1", "T2"])
 def test_a_profile_that_reaches_a_double_pole_does_not_go_on_in_the_other_copy(name: str) -> None:
     near = TRUTH | {"T1": 1.1, "T2": 0.9}
-    clean = simulate(model("in series"), [U], near, times=TIMES).channels[0]
+    clean = simulate(build_model("in series"), [U], near, times=TIMES).channels[0]
     noise = np.random.default_rng(4).normal(0, 0.2, TIMES.size)
     data = Record((U,), (Channel("z", TIMES, clean.values + noise, "m"),))
-    posed = Problem.build(model("in series"), [data])
+    posed = Problem.build(build_model("in series"), [data])
     found = compute_profile(posed, np.array(list(near.values())), name, points=7)
     own = found.others[:, 2]
     larger, smaller = (found.values, own) if name == "T1" else (own, found.values)

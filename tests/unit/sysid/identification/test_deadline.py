@@ -17,7 +17,7 @@ from sysid.identification.run import advance_run, begin_run
 from sysid.search import least_squares
 from sysid.search.least_squares import N_TRIED
 from sysid.search.refine import refine_candidates
-from tests.searching import example
+from tests.support.library.search_problems import example
 
 NEAR = np.array([0.22, 0.52, 5.1, 1.1])
 APART = np.array([0.25, 0.6, 5.6, 1.3])
@@ -25,7 +25,7 @@ LIMITED = GeneticAlgorithm(population=32, generations=3, islands=2, stop=Stop(se
 SAID = "the time limit ended least squares before"
 
 
-def asked(late_after: int) -> Callable[[], bool]:
+def make_question(late_after: int) -> Callable[[], bool]:
     """A question that is answered with no so many times."""
     times: list[None] = []
 
@@ -58,9 +58,9 @@ def test_least_squares_that_is_late_ends_between_its_calls(monkeypatch: pytest.M
     monkeypatch.setattr(
         least_squares, "_STEPS_PER_CALL", problem.n_steps * (4 + N_TRIED)
     )  # a step a call
-    [first] = refine_candidates(problem, [NEAR], None, asked(0))
-    [second] = refine_candidates(problem, [NEAR], None, asked(1))
-    never = refine_candidates(problem, [NEAR], None, asked(10**6))[0]
+    [first] = refine_candidates(problem, [NEAR], None, make_question(0))
+    [second] = refine_candidates(problem, [NEAR], None, make_question(1))
+    never = refine_candidates(problem, [NEAR], None, make_question(10**6))[0]
     assert whole is not None
     assert first is not None
     assert second is not None
@@ -74,7 +74,7 @@ def test_least_squares_that_is_late_ends_between_its_calls(monkeypatch: pytest.M
 
 def test_late_no_other_start_is_begun_with_and_the_best_one_tells() -> None:
     problem = example()
-    best, other = refine_candidates(problem, [NEAR, APART], None, asked(0))
+    best, other = refine_candidates(problem, [NEAR, APART], None, make_question(0))
     assert best is not None
     assert best.is_cut_short
     assert other is None

@@ -10,8 +10,8 @@ from sysid import Identification, identify, load_model
 from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.data.records import Record
 from sysid.identification.run import advance_run, begin_run, exchange_migrants, find_next_border
-from tests.runs import step_record
-from tests.searching import DUFFING, bits, example, noisy, record
+from tests.support.cluster.small_runs import step_record
+from tests.support.library.search_problems import DUFFING, bits, example, noisy, record
 
 Given = Mapping[str, float] | Sequence[Mapping[str, float]]
 
@@ -25,12 +25,14 @@ BOUNDS = {
 
 
 @cache
-def records() -> tuple[Record, Record]:
+def make_records() -> tuple[Record, Record]:
     """The tube before, and after a change: another lag, other noise."""
     return step_record(400, delay=0.7, seed=3), step_record(400, delay=1.1, seed=8)
 
 
-def found(record: Record, warm: dict[str, float] | None = None, seed: int = 1) -> Identification:
+def identify_lag(
+    record: Record, warm: dict[str, float] | None = None, seed: int = 1
+) -> Identification:
     """Identify without other orders and noise models: the simulations are counted."""
     return identify(
         load_model("fopdt"),
@@ -43,16 +45,16 @@ def found(record: Record, warm: dict[str, float] | None = None, seed: int = 1) -
     )
 
 
-def values(one: Identification) -> dict[str, float]:
+def read_values(one: Identification) -> dict[str, float]:
     return {estimate.name: estimate.value for estimate in one.parameters}
 
 
 def test_a_warm_start_halves_the_simulations_and_ends_at_the_same_result() -> None:
-    before, after = records()
+    before, after = make_records()
     spent = {"cold": 0, "warm": 0}
     for seed in range(1, 5):
-        cold = found(after, seed=seed)
-        warm = found(after, values(found(before, seed=seed)), seed=seed)
+        cold = identify_lag(after, seed=seed)
+        warm = identify_lag(after, read_values(identify_lag(before, seed=seed)), seed=seed)
         spent["cold"] += cold.evaluations
         spent["warm"] += warm.evaluations
         for one, other in zip(cold.parameters, warm.parameters, strict=True):
@@ -63,16 +65,16 @@ def test_a_warm_start_halves_the_simulations_and_ends_at_the_same_result() -> No
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_warm_start_from_a_false_place_ends_at_the_same_result(seed: int) -> None:
-    after = records()[1]
-    cold = found(after, seed=seed)
-    warm = found(after, {"K": -3.0, "T": 9.0, "L": 0.0}, seed=seed)
+    after = make_records()[1]
+    cold = identify_lag(after, seed=seed)
+    warm = identify_lag(after, {"K": -3.0, "T": 9.0, "L": 0.0}, seed=seed)
     assert warm.rms == pytest.approx(cold.rms, rel=1e-6)
 
 
 def test_a_warm_start_repeats_bit_for_bit() -> None:
-    before, after = records()
-    start = values(found(before))
-    assert values(found(after, start)) == values(found(after, start))
+    before, after = make_records()
+    start = read_values(identify_lag(before))
+    assert read_values(identify_lag(after, start)) == read_values(identify_lag(after, start))
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from sysid.search.island import Island, evolve, split_population
 from sysid.search.operators import decode
 from sysid.search.state import IslandPlan
 from sysid.simulation.scaling import from_unit
-from tests.searching import bits, example, with_search
+from tests.support.library.search_problems import bits, example, with_search
 
 ALGORITHM = GeneticAlgorithm(
     method="simple", population=26, islands=4, generations=3, migration=Migration(every=100)
@@ -28,7 +28,9 @@ ALGORITHM = GeneticAlgorithm(
 UNEQUAL = replace(ALGORITHM, islands=tuple(IslandChange(bits=count) for count in (24, 12, 20, 12)))
 
 
-def evolved(algorithm: GeneticAlgorithm) -> tuple[tuple[Island, ...], tuple[IslandPlan, ...]]:
+def evolve_islands(
+    algorithm: GeneticAlgorithm,
+) -> tuple[tuple[Island, ...], tuple[IslandPlan, ...]]:
     """Islands after some generations without migration, and their plans."""
     problem = example(n=80)
     plans = make_plans(problem, algorithm, 4)
@@ -39,8 +41,8 @@ def evolved(algorithm: GeneticAlgorithm) -> tuple[tuple[Island, ...], tuple[Isla
     ), plans
 
 
-def islands() -> tuple[Island, ...]:
-    return evolved(ALGORITHM)[0]
+def make_islands() -> tuple[Island, ...]:
+    return evolve_islands(ALGORITHM)[0]
 
 
 def test_topologies_connect_as_named() -> None:
@@ -64,7 +66,7 @@ def test_no_topology_sends_an_island_its_own(name: TopologyName) -> None:
 @pytest.mark.parametrize("name", TOPOLOGIES)
 @pytest.mark.parametrize("migrants", [0, 1, 2, 50])
 def test_migration_keeps_sizes_and_worsens_nobody(name: TopologyName, migrants: int) -> None:
-    before = islands()
+    before = make_islands()
     after, _ = migrate(before, (24,) * 4, Migration(topology=name, migrants=migrants), 0)
     for old, new in zip(before, after, strict=True):
         assert new.chromosomes.shape == old.chromosomes.shape
@@ -75,14 +77,14 @@ def test_migration_keeps_sizes_and_worsens_nobody(name: TopologyName, migrants: 
 
 
 def test_unconnected_migration_is_the_identity() -> None:
-    before = islands()
+    before = make_islands()
     after, log = migrate(before, (24,) * 4, Migration(topology="unconnected"), 0)
     assert [bits(i) for i in after] == [bits(i) for i in before]
     assert log == ()
 
 
 def test_migrants_are_copies_of_the_best_before_the_exchange() -> None:
-    before = islands()
+    before = make_islands()
     after, log = migrate(before, (24,) * 4, Migration(migrants=2), 7)
     assert len(log) >= 3
     for source, lines in groupby(log, key=lambda line: line.source):
@@ -98,7 +100,7 @@ def test_migrants_are_copies_of_the_best_before_the_exchange() -> None:
 
 
 def test_a_champion_travels_one_connection_in_an_exchange() -> None:
-    before = sorted(islands(), key=lambda island: island.champion_rms)
+    before = sorted(make_islands(), key=lambda island: island.champion_rms)
     assert len({island.champion_rms for island in before}) == 4
     after, _ = migrate(before, (24,) * 4, Migration(migrants=1), 0)
     for source, destination in zip(before[:-1], after[1:], strict=True):
@@ -115,7 +117,7 @@ def test_after_an_exchange_fitness_is_that_of_the_chromosome(
 ) -> None:
     """Islands of unequal bits round migrants, so these are evaluated where they arrive."""
     problem = example(n=80)
-    before, plans = evolved(algorithm)
+    before, plans = evolve_islands(algorithm)
     after, log = migrate(
         before, [plan.bits for plan in plans], Migration(topology=name, migrants=2), 0
     )
@@ -138,7 +140,9 @@ def test_after_an_exchange_fitness_is_that_of_the_chromosome(
 
 
 def test_a_migrant_as_fit_as_the_worst_individual_does_not_arrive() -> None:
-    before = tuple(replace(island, fitness=np.ones_like(island.fitness)) for island in islands())
+    before = tuple(
+        replace(island, fitness=np.ones_like(island.fitness)) for island in make_islands()
+    )
     after, log = migrate(before, (24,) * 4, Migration(topology="fully-connected"), 0)
     assert log == ()
     assert [bits(i) for i in after] == [bits(i) for i in before]
@@ -154,7 +158,7 @@ def test_a_better_champion_has_to_be_confirmed_again_and_another_one_stays_confi
         "champion_discontinuities": 1,
         "champion_explained": 1,
     }
-    before = tuple(with_search(island, **evidence) for island in islands())
+    before = tuple(with_search(island, **evidence) for island in make_islands())
     after, _ = migrate(before, (24,) * 4, Migration(topology="fully-connected"), 0)
     changed = [new.champion_rms < old.champion_rms for old, new in zip(before, after, strict=True)]
     assert sorted(changed) == [False, True, True, True]
@@ -164,7 +168,7 @@ def test_a_better_champion_has_to_be_confirmed_again_and_another_one_stays_confi
 
 
 def test_a_better_champion_by_migration_is_in_the_history() -> None:
-    before = islands()
+    before = make_islands()
     after, _ = migrate(before, (24,) * 4, Migration(topology="fully-connected"), 0)
     best = min(island.champion_rms for island in before)
     assert all(island.champion_rms == best == island.fitness[0] for island in after)
@@ -173,7 +177,9 @@ def test_a_better_champion_by_migration_is_in_the_history() -> None:
 
 
 def test_a_migrant_that_is_there_already_does_not_arrive_again() -> None:
-    once, _ = migrate(islands(), (24,) * 4, Migration(topology="fully-connected", migrants=1), 0)
+    once, _ = migrate(
+        make_islands(), (24,) * 4, Migration(topology="fully-connected", migrants=1), 0
+    )
     twice, log = migrate(once, (24,) * 4, Migration(topology="fully-connected", migrants=1), 1)
     assert log == ()
     assert [bits(i) for i in once] == [bits(i) for i in twice]

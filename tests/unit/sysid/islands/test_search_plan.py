@@ -10,7 +10,7 @@ from sysid.islands.archipelago import create_islands, make_plans
 from sysid.islands.evolve import compute_next_border, make_search_plan, unpack_plan
 from sysid.search.operators import decode, get_mutation_rate
 from sysid.simulation.scaling import to_unit
-from tests.searching import example
+from tests.support.library.search_problems import example
 
 DIFFERENT = GeneticAlgorithm(
     population=26,

@@ -14,7 +14,7 @@ from sysid.islands.stopping import count_restarts, has_search_ended, make_stoppi
 from sysid.models.catalogue.load import load_model
 from sysid.search.state import SEARCH_RECORD, Improvement, SearchArray
 from sysid.simulation.problem import Problem
-from tests.searching import DUFFING, example, noisy, record
+from tests.support.library.search_problems import DUFFING, example, noisy, record
 
 ALONE = GeneticAlgorithm(islands=1, migration=Migration(every=1))
 

@@ -11,7 +11,7 @@ from sysid.kernels import build
 from sysid.kernels.layout import KernelVariant
 from sysid.models.model import Model
 from sysid.simulation.problem import Problem
-from tests.models import difference, duffing, individuals, record
+from tests.support.library.small_models import difference, duffing, individuals, record
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-def fitness() -> np.ndarray:
+def compute_fitness() -> np.ndarray:
     problem = Problem.build(duffing(), [record()])
     return problem.evaluate_fitness(individuals(problem, 4))
 
@@ -36,22 +36,22 @@ def refuse(model: Model, variant: KernelVariant) -> bytes:
 def test_a_kernel_is_compiled_once_and_found_again(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = fitness()
+    first = compute_fitness()
     assert len(list(folder.glob("*.o"))) == 1
     monkeypatch.setattr(build, "_kernel_addresses", {})
     monkeypatch.setattr(build, "compile_kernel", refuse)
-    np.testing.assert_array_equal(fitness(), first)
+    np.testing.assert_array_equal(compute_fitness(), first)
 
 
 def test_the_cache_folder_is_private(folder: Path) -> None:
-    fitness()
+    compute_fitness()
     assert folder.stat().st_mode & 0o777 == 0o700
 
 
 def test_a_folder_that_others_may_write_to_is_not_used(folder: Path) -> None:
     folder.mkdir(mode=0o777)
     folder.chmod(0o777)
-    fitness()
+    compute_fitness()
     assert not list(folder.iterdir())
 
 
@@ -59,7 +59,7 @@ def test_a_folder_that_others_may_write_to_is_not_used(folder: Path) -> None:
 def test_a_damaged_file_is_made_again(
     folder: Path, damage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = fitness()
+    first = compute_fitness()
     (path,) = folder.glob("*.o")
     content = bytearray(path.read_bytes())
     if damage == "flip":
@@ -70,7 +70,7 @@ def test_a_damaged_file_is_made_again(
         content = bytearray((folder / f"{key}.o").read_bytes())
     path.write_bytes(bytes({"cut": content[:100], "empty": content[:0]}.get(damage, content)))
     monkeypatch.setattr(build, "_kernel_addresses", {})
-    np.testing.assert_array_equal(fitness(), first)
+    np.testing.assert_array_equal(compute_fitness(), first)
     assert path.stat().st_size > 1000
 
 
@@ -79,7 +79,7 @@ def test_without_a_writable_folder_kernels_still_work(
 ) -> None:
     folder.parent.joinpath("file").write_text("not a folder")
     monkeypatch.setenv("LAGID_CACHE_DIR", str(folder.parent / "file" / "cache"))
-    assert np.all(np.isfinite(fitness()))
+    assert np.all(np.isfinite(compute_fitness()))
 
 
 def test_the_key_tells_models_and_variants_apart_but_not_their_bounds() -> None:
@@ -98,5 +98,5 @@ def test_the_key_tells_models_and_variants_apart_but_not_their_bounds() -> None:
 
 
 def test_a_stale_temporary_file_is_left_nowhere(folder: Path) -> None:
-    fitness()
+    compute_fitness()
     assert os.listdir(folder) == [path.name for path in folder.glob("*.o")]

@@ -14,7 +14,7 @@ from sysid.kernels.layout import KernelVariant
 from sysid.kernels.machine_code import compile_assembly
 from sysid.models.catalogue.load import catalogue, load_model
 from sysid.models.model import Model
-from tests.models import differential, duffing
+from tests.support.library.small_models import differential, duffing
 
 VARIANT = KernelVariant(one_step=False, soft=False, on_grid=True, weighted=False)
 

@@ -30,7 +30,7 @@ from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.linear_model import factor_covariance, linearise_outputs, make_move_generator
-from tests.searching import COULOMB, clean, example, noisy, record
+from tests.support.library.search_problems import COULOMB, clean, example, noisy, record
 
 TRUTH = np.array([0.2, 0.5, 5.0, 1.0])  # of Example 1
 FALSE = np.array([0.192, 0.495, 5.002, 0.485])

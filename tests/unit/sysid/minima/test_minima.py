@@ -27,7 +27,7 @@ from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import to_unit
 from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.linear_model import LinearOutputModel
-from tests import searching
+from tests.support.library import search_problems
 
 STEP, GAIN, TIME, LAG, PERIOD = 0.2, 2.0, 1.5, 1.33, 5.0
 FINE = 40
@@ -68,12 +68,12 @@ def periodic(count: int = 300) -> FloatArray:
     return np.where(np.round(np.arange(count) * STEP, 6) % PERIOD < 2.0, 1.0, -0.5)
 
 
-def steps(count: int = 300) -> FloatArray:
+def make_steps(count: int = 300) -> FloatArray:
     random = np.random.default_rng(4)
     return np.repeat(random.uniform(-1, 1, count // 6 + 1), 6)[:count]
 
 
-def record(u: FloatArray, first: int, seed: int = 1) -> Record:
+def make_record(u: FloatArray, first: int, seed: int = 1) -> Record:
     """The part of a longer recording that begins at sample `first`."""
     y = respond(u) + NOISE * np.random.default_rng(seed).standard_normal(u.size)
     times = np.arange(u.size - first) * STEP
@@ -82,11 +82,11 @@ def record(u: FloatArray, first: int, seed: int = 1) -> Record:
     )
 
 
-def status(found: Identification, name: str) -> str:
+def find_status(found: Identification, name: str) -> str:
     return next(one.status for one in found.parameters if one.name == name)
 
 
-def reason(found: Identification, name: str) -> str:
+def find_reason(found: Identification, name: str) -> str:
     return next(one.reason for one in found.parameters if one.name == name)
 
 
@@ -118,7 +118,7 @@ def test_a_scan_of_the_lag_leads_out_of_a_false_minimum() -> None:
 
 
 def test_a_scan_keeps_its_budget_and_its_start() -> None:
-    problem = Problem.build(lag_model(), [record(steps(), 0)])
+    problem = Problem.build(lag_model(), [make_record(make_steps(), 0)])
     start = RefinedCandidate(np.array([2.0, 1.5, 4.0, 0.0]), 1.0, 0)
     for budget in (0, 10, 150, 200):
         found = scan_parameters(problem, start, [2], budget)
@@ -127,20 +127,20 @@ def test_a_scan_keeps_its_budget_and_its_start() -> None:
 
 
 def test_lags_a_period_apart_are_listed_where_the_start_is_skipped() -> None:
-    found = identify(lag_model(), record(periodic(500), 200), skip=120, seed=3)
-    assert status(found, "L") == "ambiguous"
+    found = identify(lag_model(), make_record(periodic(500), 200), skip=120, seed=3)
+    assert find_status(found, "L") == "ambiguous"
     lags = sorted(one.values[2] for one in found.search.minima if one.is_compatible)
     assert lags == pytest.approx([LAG, LAG + PERIOD, LAG + 2 * PERIOD], abs=0.02)
     (own,) = (one.value for one in found.parameters if one.name == "L")
     others = [lag for lag in lags if abs(lag - own) > 1]
     assert list_told(found) == pytest.approx(others, abs=0.01)
-    assert {status(found, name) for name in "KT"} == {"identified"}
+    assert {find_status(found, name) for name in "KT"} == {"identified"}
 
 
 def test_lags_a_period_apart_are_listed_though_an_assumed_input_tells_them_apart() -> None:
-    found = identify(lag_model(), record(periodic(500), 200), seed=3)
-    assert status(found, "L") == "ambiguous"
-    assert "where the input is recorded" in reason(found, "L")
+    found = identify(lag_model(), make_record(periodic(500), 200), seed=3)
+    assert find_status(found, "L") == "ambiguous"
+    assert "where the input is recorded" in find_reason(found, "L")
     (told,) = (text for text in found.warnings if "from before the record" in text)
     assert "Its first value is assumed there, and the data contradict it." in told
     assert sum("assumed" in text for text in found.warnings) == 1
@@ -151,8 +151,8 @@ def test_lags_a_period_apart_are_listed_though_an_assumed_input_tells_them_apart
 
 def test_lags_a_period_apart_are_listed_though_few_samples_are_skipped() -> None:
     """The skipped samples alone could tell whether the input before the record was the first."""
-    found = identify(lag_model(), record(periodic(500), 200), skip=40, seed=3)
-    assert status(found, "L") == "ambiguous"
+    found = identify(lag_model(), make_record(periodic(500), 200), skip=40, seed=3)
+    assert find_status(found, "L") == "ambiguous"
     assert list_told(found) == pytest.approx([LAG + PERIOD, LAG + 2 * PERIOD], abs=0.05)
     assert not any("contradict" in text for text in found.warnings)
 
@@ -169,27 +169,27 @@ def test_a_lag_that_the_assumed_input_has_moved_is_told_with_its_value_without()
 
 def list_told(found: Identification) -> list[float]:
     """The time lags (s) that the result names beside its own."""
-    return sorted(float(text) for text in reason(found, "L").split(" s ")[0].split(", "))
+    return sorted(float(text) for text in find_reason(found, "L").split(" s ")[0].split(", "))
 
 
 def test_a_noise_model_does_not_hide_that_the_data_contradict_the_assumed_input() -> None:
     loss = Loss(noise_model="ar1")
-    found = identify(lag_model(), record(periodic(500), 200), seed=3, loss=loss)
+    found = identify(lag_model(), make_record(periodic(500), 200), seed=3, loss=loss)
     assert found.noise_model == "ar1"
-    assert status(found, "L") == "ambiguous"
+    assert find_status(found, "L") == "ambiguous"
     assert any("and the data contradict it" in text for text in found.warnings)
 
 
 def test_a_record_that_begins_at_rest_tells_lags_a_period_apart() -> None:
-    found = identify(lag_model(), record(np.concatenate([np.full(40, -0.5), periodic()]), 0))
-    assert status(found, "L") == "identified"
+    found = identify(lag_model(), make_record(np.concatenate([np.full(40, -0.5), periodic()]), 0))
+    assert find_status(found, "L") == "identified"
     assert not any("contradict" in text for text in found.warnings)
 
 
 @pytest.mark.parametrize("skip", [0, 40])
 def test_an_input_without_a_period_tells_the_lag(skip: int) -> None:
-    found = identify(lag_model(), record(steps(500), 200), skip=skip)
-    assert status(found, "L") == "identified"
+    found = identify(lag_model(), make_record(make_steps(500), 200), skip=skip)
+    assert find_status(found, "L") == "identified"
     (own,) = (one for one in found.parameters if one.name == "L")
     assert own.stderr is not None
     assert abs(own.value - LAG) <= 4 * own.stderr + 0.1
@@ -246,11 +246,11 @@ def test_champions_that_are_not_refined_are_no_minima(method: SearchMethod) -> N
 
 
 def _duffing_record() -> Record:
-    return searching.record(searching.noisy(seed=5))
+    return search_problems.record(search_problems.noisy(seed=5))
 
 
 def test_equal_ends_are_one_minimum_and_ratios_are_of_likelihoods() -> None:
-    problem = Problem.build(lag_model(), [record(steps(), 0)])
+    problem = Problem.build(lag_model(), [make_record(make_steps(), 0)])
     ends = [
         Fit(np.array([2.0, 1.5, 1.33, 0.0]), 0.02),
         Fit(np.array([2.001, 1.501, 1.331, 0.001]), 0.02, 4, 3),
@@ -269,7 +269,7 @@ def test_equal_ends_are_one_minimum_and_ratios_are_of_likelihoods() -> None:
 
 def test_ends_in_one_flat_valley_are_one_minimum() -> None:
     """Least squares ends anywhere along what the data leave open, here K and T together."""
-    problem = Problem.build(lag_model(), [record(steps(), 0)])
+    problem = Problem.build(lag_model(), [make_record(make_steps(), 0)])
     best = np.array([2.0, 1.5, 1.33, 0.0])
     along, across = best.copy(), best.copy()
     along[:2] += 0.5
@@ -277,19 +277,19 @@ def test_ends_in_one_flat_valley_are_one_minimum() -> None:
     fits = [Fit(best, 0.02), Fit(along, 0.02001, 3, 3), Fit(across, 0.02001)]
     root = 20.0 * np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
 
-    def collected(ratio: float) -> list[tuple[int, int]]:
+    def collect_counts(ratio: float) -> list[tuple[int, int]]:
         flat = LinearOutputModel(
             np.eye(4), root, np.zeros(4), 300 * 0.02**2, np.array([1.0, ratio, 1.0, 1.0])
         )
         return [(one.count, one.independent) for one in collect_minima(problem, fits, flat)]
 
-    assert collected(1.0) == [(4, 3), (1, 0)]
-    assert collected(np.nan) == [(1, 0), (3, 3), (1, 0)]  # T is not in the linear model
+    assert collect_counts(1.0) == [(4, 3), (1, 0)]
+    assert collect_counts(np.nan) == [(1, 0), (3, 3), (1, 0)]  # T is not in the linear model
     assert len(collect_minima(problem, fits)) == 3
 
 
 def test_an_estimate_that_a_noise_model_moved_is_not_ambiguous_for_it() -> None:
-    problem = Problem.build(lag_model(), [record(steps(), 0)])
+    problem = Problem.build(lag_model(), [make_record(make_steps(), 0)])
     names = problem.free_names
     white, moved, far = (
         np.array([2.0, 1.5, 1.33, 0.0]),

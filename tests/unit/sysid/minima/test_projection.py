@@ -21,12 +21,12 @@ from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import to_unit
 from sysid.simulation.simulate import simulate
-from tests.searching import example
+from tests.support.library.search_problems import example
 
 TRUTH = {"K": 0.9, "T1": 0.3, "r": 0.6, "L": 0.17, "y0": 4.8, "w(0)": -0.6, "x(0)": -0.1}
 
 
-def telegraph(noise: float = 0.05, colour: float = 0.0) -> Record:
+def make_telegraph(noise: float = 0.05, colour: float = 0.0) -> Record:
     """A second-order plant under an input of two levels at random, far faster than its bounds."""
     random = np.random.default_rng(11)
     times = 0.08 * np.arange(400)
@@ -36,8 +36,8 @@ def telegraph(noise: float = 0.05, colour: float = 0.0) -> Record:
     return Record((u,), (replace(y, values=y.values + slow + random.normal(0, noise, 400)),))
 
 
-def plant() -> Problem:
-    return Problem.build(load_model("sopdt"), [telegraph()])
+def build_plant() -> Problem:
+    return Problem.build(load_model("sopdt"), [make_telegraph()])
 
 
 def place(problem: Problem, **changes: float) -> FloatArray:
@@ -45,7 +45,7 @@ def place(problem: Problem, **changes: float) -> FloatArray:
 
 
 def test_gain_offset_and_starts_of_a_linear_plant_are_linear() -> None:
-    problem = plant()
+    problem = build_plant()
     for theta in (place(problem), place(problem, K=-20.0, T1=30.0, L=9.0)):
         linear, spent = find_linear_parameters(problem, theta)
         assert {problem.free_names[d] for d in linear} == {"K", "y0", "w(0)", "x(0)"}
@@ -63,7 +63,7 @@ def test_two_gains_in_a_row_are_not_linear_together() -> None:
         "outputs": {"y": "x"},
         "initial": {"w": 0, "x": 0},
     }
-    record = telegraph()
+    record = make_telegraph()
     problem = Problem.build(parse_model(document), [record])
     linear, _ = find_linear_parameters(problem, np.array([1.0, 1.0, 1.0]))
     assert [problem.free_names[d] for d in linear] in (["a"], ["b"])
@@ -79,7 +79,7 @@ def test_a_nonlinear_model_has_no_linear_parameter_and_costs_no_more_than_the_te
 
 
 def test_at_drawn_places_no_linear_parameter_can_be_better() -> None:
-    problem = plant()
+    problem = build_plant()
     places, fitness, spent = draw_projected_points(problem, place(problem), 1, 2000)
     lower, upper = problem.evaluator.lower, problem.evaluator.upper
     assert len(places) > 100
@@ -100,7 +100,7 @@ def test_at_drawn_places_no_linear_parameter_can_be_better() -> None:
 
 @pytest.mark.parametrize("seed", range(1, 6))
 def test_a_scan_by_projection_leads_out_of_a_false_minimum(seed: int) -> None:
-    problem = plant()
+    problem = build_plant()
     false, best = refine_candidates(
         problem, [place(problem, K=-0.5, L=9.0, T1=0.5), place(problem)]
     )
@@ -114,7 +114,7 @@ def test_a_scan_by_projection_leads_out_of_a_false_minimum(seed: int) -> None:
 
 
 def test_a_budget_is_kept_and_a_small_one_draws_nothing() -> None:
-    problem = plant()
+    problem = build_plant()
     for budget in (0, 10, 100, 300, 700):
         places, _, spent = draw_projected_points(problem, place(problem), 1, budget)
         assert spent <= budget
@@ -124,14 +124,14 @@ def test_a_budget_is_kept_and_a_small_one_draws_nothing() -> None:
 @pytest.mark.parametrize("seed", [1, 3])
 def test_the_bounds_of_a_catalogue_model_hide_no_lag(seed: int) -> None:
     """Residuals with a part of a disturbance: nothing shows that the search has found all."""
-    found = identify(load_model("sopdt"), telegraph(colour=0.3), seed=seed)
+    found = identify(load_model("sopdt"), make_telegraph(colour=0.3), seed=seed)
     (lag,) = (one for one in found.parameters if one.name == "L")
     assert lag.value == pytest.approx(TRUTH["L"], abs=0.05)
     assert found.search.agreeing_starts >= 2
 
 
 def test_negligible_residuals_and_noise_leave_no_doubt() -> None:
-    problem = plant()
+    problem = build_plant()
     assert is_explained(problem, 0.9e-3 * problem.output_scale, None)
     assert not is_explained(problem, 1.1e-3 * problem.output_scale, None)
     for theta, explained in ((place(problem), True), (place(problem, L=0.6), False)):
@@ -149,6 +149,6 @@ def test_nothing_is_drawn_where_the_residuals_are_noise(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(best_estimate, "scan_by_projection", refuse)
     quick = GeneticAlgorithm(generations=60)
-    found = identify(load_model("sopdt"), telegraph(), quick, seed=1)
+    found = identify(load_model("sopdt"), make_telegraph(), quick, seed=1)
     assert found.search.because == "residuals"
     assert found.search.agreeing_starts < 2

@@ -12,14 +12,14 @@ from sysid.identification.identify import identify
 from sysid.models.catalogue.load import copy_catalogue_document, load_model
 from sysid.models.parse import parse_model
 from sysid.simulation.simulate import simulate
-from tests.catalogue_cases import ARM
+from tests.support.library.catalogue_cases import ARM
 
 PUBLISHED = ARM | {"theta_s": 0.75 * pi}
 KNOWN_SPREAD = {"J": 3e-3, "F_c": 1.5e-3, "F_max": 1.5e-3, "k_a": 5e-3, "k_c": 6e-3}
 TIMES = 0.01 * np.arange(800)
 
 
-def pressure(amplitude: float, seed: int = 1) -> Channel:
+def make_pressure(amplitude: float, seed: int = 1) -> Channel:
     """Waves and a random binary signal: the arm breaks away some twenty times in 8 s."""
     rng = np.random.default_rng(seed)
     waves = sum(
@@ -86,7 +86,7 @@ class Twin:
 
 @pytest.mark.parametrize("amplitude", [8e3, 60e3])  # the second one reaches the end stops
 def test_the_step_equals_its_twin(amplitude: float) -> None:
-    given, twin, found = pressure(amplitude), Twin(PUBLISHED), [0.0]
+    given, twin, found = make_pressure(amplitude), Twin(PUBLISHED), [0.0]
     for k in range(3999):
         if k % 5 == 0 and k:
             found.append(twin.theta)
@@ -97,7 +97,7 @@ def test_the_step_equals_its_twin(amplitude: float) -> None:
 
 
 def test_half_the_step_has_a_quarter_of_the_error() -> None:
-    given = pressure(12e3)
+    given = make_pressure(12e3)
     exact = angle(given, 256)
     coarse, fine = (float(np.std(angle(given, n) - exact)) for n in (2, 8))
     assert coarse < 5e-4
@@ -114,7 +114,7 @@ def test_below_break_away_the_arm_stays_and_above_it_moves() -> None:
 
 
 def test_both_exact_symmetries_leave_the_angle_unchanged() -> None:
-    given = pressure(12e3)
+    given = make_pressure(12e3)
     before = angle(given)
     forces = {name: 1.7 * PUBLISHED[name] for name in ("J", "B", "F_c", "F_max", "A_m")}
     np.testing.assert_allclose(angle(given, **forces), before, rtol=0, atol=1e-9)
@@ -128,7 +128,7 @@ def test_both_exact_symmetries_leave_the_angle_unchanged() -> None:
 
 @pytest.mark.slow
 def test_the_published_parameters_are_found_again_from_the_exact_plant() -> None:
-    given = pressure(12e3)
+    given = make_pressure(12e3)
     noise = 1e-3 * np.random.default_rng(5).standard_normal(800)
     exact = simulate_actuator(Actuator(), given).channel("theta").values
     measured = Channel("theta", TIMES, exact + noise, "rad")

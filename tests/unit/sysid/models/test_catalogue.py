@@ -13,7 +13,7 @@ from sysid.models.delays import check_delays
 from sysid.models.documents import MAX_DOCUMENT_CHARACTERS, parse_yaml
 from sysid.models.parameters import override_parameters
 from sysid.models.parse import parse_model
-from tests.meaning import simulate
+from tests.support.library.expression_values import simulate
 
 BUILT_IN = (
     "actuator",

@@ -37,7 +37,7 @@ DISCRETE: dict[str, Any] = {
 }
 
 
-def faults(base: dict[str, Any], **changes: Any) -> dict[str, str]:
+def list_faults(base: dict[str, Any], **changes: Any) -> dict[str, str]:
     with pytest.raises(InvalidModel) as caught:
         parse_model(base | changes)
     return {fault.pointer: fault.detail for fault in caught.value.faults}
@@ -106,7 +106,7 @@ def test_a_document_is_not_changed_by_reading_it() -> None:
 
 @pytest.mark.parametrize("base", [CONTINUOUS, DISCRETE])
 def test_a_wrong_form_does_not_hide_the_other_faults(base: dict[str, Any]) -> None:
-    told = faults(base, form="ode", equations=base["equations"] | {"x": "x^2"})
+    told = list_faults(base, form="ode", equations=base["equations"] | {"x": "x^2"})
     assert set(told) == {"/form", "/equations/x"}
     assert "^" in told["/equations/x"]
 
@@ -161,7 +161,7 @@ def test_a_wrong_form_does_not_hide_the_other_faults(base: dict[str, Any]) -> No
 def test_a_fault_of_a_differential_document_is_told_where_it_is(
     changes: dict[str, Any], pointer: str, part: str
 ) -> None:
-    found = faults(CONTINUOUS, **changes)
+    found = list_faults(CONTINUOUS, **changes)
     assert next(iter(found)) == pointer
     assert part in found[pointer]
 
@@ -185,7 +185,7 @@ def test_a_fault_of_a_differential_document_is_told_where_it_is(
 def test_a_fault_of_a_parameter_does_not_make_its_name_unknown(
     entry: object, pointer: str, part: str
 ) -> None:
-    found = faults(CONTINUOUS, parameters={"c": {"lower": 0, "upper": 1}, "L": entry})
+    found = list_faults(CONTINUOUS, parameters={"c": {"lower": 0, "upper": 1}, "L": entry})
     assert list(found) == [pointer]
     assert part in found[pointer]
 
@@ -206,7 +206,7 @@ def test_a_fault_of_a_difference_document_is_told_where_it_is(
     changes: dict[str, Any], pointer: str, part: str
 ) -> None:
     free = {"parameters": {"d": {"lower": 1, "upper": 3}}}
-    found = faults(DISCRETE | free, **changes)
+    found = list_faults(DISCRETE | free, **changes)
     assert pointer in found
     assert part in found[pointer]
 
@@ -224,7 +224,7 @@ def test_a_tie_that_cannot_be_is_told_where_it_is(
     entry: dict[str, Any], pointer: str, part: str
 ) -> None:
     both = {"lower": 0, "upper": 1}
-    found = faults(CONTINUOUS, parameters={"c": both, "L": both | entry})
+    found = list_faults(CONTINUOUS, parameters={"c": both, "L": both | entry})
     assert part in found[pointer]
 
 
@@ -277,7 +277,7 @@ def test_what_is_no_document_is_refused_in_one_line(document: object) -> None:
     ],
 )
 def test_documents_beyond_the_limits_are_refused(changes: dict[str, Any], pointer: str) -> None:
-    found = faults(CONTINUOUS, **changes)
+    found = list_faults(CONTINUOUS, **changes)
     assert "at most" in found[pointer]
 
 
@@ -291,7 +291,9 @@ def test_documents_beyond_the_limits_are_refused(changes: dict[str, Any], pointe
 def test_a_lag_in_minutes_is_not_read_in_seconds(unit: str, index: str, right: str) -> None:
     lag = {"L": {"lower": 0, "upper": 1, "unit": unit}, "c": {"lower": 0, "upper": 1}}
     changed = {"parameters": lag, "equations": {"x": "v", "v": f"q(t) - c*v({index}) - x"}}
-    assert faults(CONTINUOUS, **changed) == {"/parameters/L/unit": f"found {unit!r}, but {right}"}
+    assert list_faults(CONTINUOUS, **changed) == {
+        "/parameters/L/unit": f"found {unit!r}, but {right}"
+    }
     factored = index.replace("L", f"{right.rpartition('- ')[2]}")
     parse_model(CONTINUOUS | changed | {"equations": {"x": "v", "v": f"q - c*v({factored}) - x"}})
 
@@ -311,7 +313,7 @@ def test_a_recursions_lag_in_seconds_is_not_read_in_samples(
         "parameters": {"d": {"lower": 1, "upper": 9, "unit": unit}},
         "equations": {"x": "0.5*w + w(k-3)", "w": f"x({index})"},
     }
-    told = faults(DISCRETE, **changed)
+    told = list_faults(DISCRETE, **changed)
     assert told == {"/parameters/d/unit": f"found {unit!r}, but this delay is in {right}"}
     fits = {"s": "k-1-d/h", "min": "k-1-60*d/h"}[unit]
     parse_model(DISCRETE | changed | {"equations": {"x": "w", "w": f"x({fits})"}})
@@ -336,7 +338,7 @@ def test_all_expressions_of_a_model_count_together(part: str) -> None:
         "initial": dict.fromkeys(states, "c"),
     }
     parse_model(document)
-    told = faults(document, **{part: dict.fromkeys(document[part], "+".join(["c"] * 1000))})
+    told = list_faults(document, **{part: dict.fromkeys(document[part], "+".join(["c"] * 1000))})
     assert list(told) == ["/equations"]
     assert f"at most {MAX_NODES} are compiled" in told["/equations"]
 
@@ -344,14 +346,14 @@ def test_all_expressions_of_a_model_count_together(part: str) -> None:
 def test_the_terms_of_a_polynomial_count_too() -> None:
     terms = ["*".join(f"y(k-{n + j})" for j in range(27)) for n in range(1, 250)]
     fields = {"form": "polynomial", "output": "y", "terms": terms}
-    told = faults({"name": "many", **fields, "coefficients": {"lower": -1, "upper": 1}})
+    told = list_faults({"name": "many", **fields, "coefficients": {"lower": -1, "upper": 1}})
     assert list(told) == ["/terms"]
     assert "are compiled" in told["/terms"]
 
 
 def test_the_texts_of_all_expressions_are_bounded_before_they_are_parsed() -> None:
     texts = {f"x{n}": "c" + " " * 3000 for n in range(60)}
-    told = faults(
+    told = list_faults(
         {"name": "long", "form": "differential", "states": dict.fromkeys(texts, "m")},
         parameters={"c": {"lower": 0, "upper": 1}},
         equations=texts,
@@ -373,7 +375,7 @@ def test_a_text_that_needs_quotes_is_told_so(sign: str) -> None:
 
 @pytest.mark.parametrize("name", ["x'", "dx", "dx/dt", "der(x)", "x_dot", "x(t)"])
 def test_an_equation_with_the_name_of_a_derivative_is_told_its_state(name: str) -> None:
-    found = faults(CONTINUOUS, equations={name: "v", "v": "-x"})
+    found = list_faults(CONTINUOUS, equations={name: "v", "v": "-x"})
     assert "write x: …, which is dx/dt" in next(iter(found.values()))
 
 

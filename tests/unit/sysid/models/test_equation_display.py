@@ -8,7 +8,7 @@ from sysid.language.mathml import format_mathml
 from sysid.models.catalogue.load import catalogue, load_model
 from sysid.models.equation_display import MAX_SHOWN_TERMS, format_equations
 from sysid.models.parse import parse_model
-from tests.models import differential
+from tests.support.library.small_models import differential
 
 _MATH = "{http://www.w3.org/1998/Math/MathML}math"
 

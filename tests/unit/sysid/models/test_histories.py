@@ -18,7 +18,7 @@ from sysid.models.parse import parse_model
 from sysid.models.unused import find_unused_names
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
-from tests.exporting import in_python
+from tests.support.library.exported_programs import run_python
 
 RATE = {"lower": -1, "upper": 1, "unit": "1/s"}
 DOCUMENT: dict[str, Any] = {
@@ -120,7 +120,7 @@ def test_a_lag_with_a_history_may_be_longer_than_the_record() -> None:
     integral = (np.exp(0.4 * (times - 1.7)) - np.exp(-0.4 * 1.7)) / 0.4
     np.testing.assert_allclose(found, 1.2 * (1 - integral), atol=1e-8)
     text = sysid.export_model(written(inputs={}), values, "python")
-    np.testing.assert_allclose(in_python(text, times, [])[0], found, rtol=1e-12)
+    np.testing.assert_allclose(run_python(text, times, [])[0], found, rtol=1e-12)
     data = Record((), (Channel("y", times, found),))
     problem = Problem.build(written(inputs={}), [data])
     delay = next(p for p in problem.all_parameters if p.name == "L")

@@ -13,8 +13,8 @@ from sysid.kernels.machine_code import optimize_assembly
 from sysid.models.parse import parse_model
 from sysid.models.unused import find_unused_names
 from sysid.simulation.problem import Problem
-from tests import reference
-from tests.models import individuals, record
+from tests.support.library import plain_twins
+from tests.support.library.small_models import individuals, record
 
 DOCUMENT: dict[str, Any] = {
     "name": "names",
@@ -50,7 +50,7 @@ def test_a_model_of_names_is_the_model_that_is_written_out() -> None:
     assert parse_model(model.document) == model
     problem = Problem.build(model, [record(24)])
     theta = individuals(problem, 3)
-    expected = [reference.predictions(problem, one) for one in theta]
+    expected = [plain_twins.predictions(problem, one) for one in theta]
     np.testing.assert_allclose(problem.predict(theta), expected, rtol=1e-9, atol=1e-11)
 
 

@@ -5,7 +5,7 @@ import re
 from sysid.language.functions import FUNCTIONS
 from sysid.models.documents import parse_yaml
 from sysid.models.parse import parse_model
-from tests.repository import ROOT
+from tests.support.checkout import ROOT
 
 PAGE = (ROOT / "docs/model.md").read_text(encoding="utf-8")
 SOLVER = ("method", "step", "substeps", "history", "interpolation")

@@ -18,7 +18,7 @@ from sysid.models.model import build_initial_parameters
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.ties import apply_ties, resolve_ties
 from sysid.simulation.problem import Problem
-from tests.models import difference, differential, lag_element
+from tests.support.library.small_models import difference, differential, lag_element
 
 
 @pytest.mark.parametrize("value", [0.0, 0.25, 1.0])
@@ -81,12 +81,12 @@ def test_the_delay_of_a_recursion_is_in_seconds_with_its_whole_samples() -> None
 
 
 def test_a_delay_that_cannot_be_negative_is_causal_down_to_0() -> None:
-    def bounded(lower: float) -> list[Parameter]:
+    def make_parameters(lower: float) -> list[Parameter]:
         return [Parameter("L", lower, 1.0, "s"), Parameter("b", 0, 1), Parameter("c", 0, 1)]
 
-    check_delays(lag_element(), bounded(0.0))
+    check_delays(lag_element(), make_parameters(0.0))
     with pytest.raises(InvalidSettings, match=r"u\(t - L\) can be as small as -0\.1 s"):
-        check_delays(lag_element(), bounded(-0.1))
+        check_delays(lag_element(), make_parameters(-0.1))
 
 
 def test_a_parameter_that_only_an_output_reads_is_used() -> None:

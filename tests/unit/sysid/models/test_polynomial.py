@@ -22,13 +22,13 @@ NARX: dict[str, Any] = {
 }
 
 
-def faults(**changes: Any) -> dict[str, str]:
+def list_faults(**changes: Any) -> dict[str, str]:
     with pytest.raises(InvalidModel) as caught:
         parse_model(NARX | changes)
     return {fault.pointer: fault.detail for fault in caught.value.faults}
 
 
-def names(**changes: Any) -> list[str]:
+def list_names(**changes: Any) -> list[str]:
     return [parameter.name for parameter in parse_model(NARX | changes).parameters]
 
 
@@ -47,9 +47,16 @@ def test_s_past_values_and_degree_m_give_c_of_s_plus_m_over_m_minus_one_coeffici
 
 
 def test_coefficients_are_named_by_their_terms_and_lags_come_last() -> None:
-    assert names(degree=1) == ["a[y(k-1)]", "a[y(k-1-dh)]", "a[u(k-1)]", "a[u(k-1-dk)]", "dh", "dk"]
-    assert "a[y(k-1)*u(k-1-dk)]" in names()
-    assert "a[y(k-1-dh)**2]" in names()
+    assert list_names(degree=1) == [
+        "a[y(k-1)]",
+        "a[y(k-1-dh)]",
+        "a[u(k-1)]",
+        "a[u(k-1-dk)]",
+        "dh",
+        "dk",
+    ]
+    assert "a[y(k-1)*u(k-1-dk)]" in list_names()
+    assert "a[y(k-1-dh)**2]" in list_names()
 
 
 def test_a_coefficient_multiplies_its_term() -> None:
@@ -68,7 +75,7 @@ def test_a_list_of_terms_replaces_all_and_needs_neither_degree_nor_lags() -> Non
 
 
 def test_a_constant_term_is_added_on_request() -> None:
-    assert names(constant=True, degree=1)[4] == "a[1]"
+    assert list_names(constant=True, degree=1)[4] == "a[1]"
     model = parse_model(NARX | {"constant": True, "terms": ["y(k-1)"], "parameters": {}})
     linear = Binary("*", Symbol("a[y(k-1)]", "parameter"), PastValue("y", "state", 1))
     assert model.equations == (Binary("+", linear, Symbol("a[1]", "parameter")),)
@@ -176,7 +183,7 @@ def _depth(tree: object) -> int:
 def test_a_fault_of_a_polynomial_document_is_told_where_it_is(
     changes: dict[str, Any], pointer: str, part: str
 ) -> None:
-    found = faults(**changes)
+    found = list_faults(**changes)
     assert part in found[pointer]
 
 
@@ -191,4 +198,4 @@ def test_a_fault_of_a_polynomial_document_is_told_where_it_is(
 def test_one_slip_is_not_told_as_a_fault_of_keep_besides(
     changes: dict[str, Any], place: str
 ) -> None:
-    assert list(faults(**changes)) == [place]
+    assert list(list_faults(**changes)) == [place]

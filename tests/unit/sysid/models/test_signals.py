@@ -12,14 +12,14 @@ MODEL = load_model("fopdt")
 T = np.arange(3.0)
 
 
-def record(inputs: list[str], outputs: list[str]) -> Record:
+def make_record(inputs: list[str], outputs: list[str]) -> Record:
     return Record(
         tuple(Channel(name, T, T) for name in inputs),
         tuple(Channel(name, T, T) for name in outputs),
     )
 
 
-def names(one: Record) -> tuple[list[str], list[str]]:
+def list_names(one: Record) -> tuple[list[str], list[str]]:
     return [channel.name for channel in one.inputs], [channel.name for channel in one.outputs]
 
 
@@ -137,7 +137,7 @@ def test_a_mapping_is_turned_only_if_both_names_exist() -> None:
 def test_a_wrong_name_is_told(given: dict[str, str], told: str) -> None:
     for assign in (
         lambda: assign_channels(MODEL, ["P1", "P2"], given),
-        lambda: assign_record(MODEL, record(["P1"], ["P2"]), given),
+        lambda: assign_record(MODEL, make_record(["P1"], ["P2"]), given),
     ):
         with pytest.raises(InvalidSettings) as caught:
             assign()
@@ -145,27 +145,27 @@ def test_a_wrong_name_is_told(given: dict[str, str], told: str) -> None:
 
 
 def test_a_record_of_the_models_names_is_the_same_object() -> None:
-    one = record(["u", "more"], ["y"])
+    one = make_record(["u", "more"], ["y"])
     assert assign_record(MODEL, one) == (one, "")
 
 
 def test_the_sides_of_a_record_say_what_is_input_and_output() -> None:
-    renamed, note = assign_record(MODEL, record(["P2"], ["P1"]))
-    assert names(renamed) == (["u"], ["y"])
+    renamed, note = assign_record(MODEL, make_record(["P2"], ["P1"]))
+    assert list_names(renamed) == (["u"], ["y"])
     assert "'u': 'P2', 'y': 'P1'" in note
-    renamed, note = assign_record(MODEL, record(["P1", "P2"], ["P3"]), {"u": "P2"})
-    assert names(renamed) == (["P1", "u"], ["y"])
+    renamed, note = assign_record(MODEL, make_record(["P1", "P2"], ["P3"]), {"u": "P2"})
+    assert list_names(renamed) == (["P1", "u"], ["y"])
 
 
 def test_a_channel_of_the_other_side_is_refused() -> None:
     with pytest.raises(InvalidSettings, match="'P2' is not among the inputs of the record"):
-        assign_record(MODEL, record(["P1"], ["P2"]), {"u": "P2"})
+        assign_record(MODEL, make_record(["P1"], ["P2"]), {"u": "P2"})
     with pytest.raises(InvalidSettings, match="'P1' is not among the outputs of the record"):
-        assign_record(MODEL, record(["P1"], ["P2"]), {"y": "P1"})
+        assign_record(MODEL, make_record(["P1"], ["P2"]), {"y": "P1"})
 
 
 def test_exchanged_sides_are_left_to_the_checks_of_the_problem() -> None:
-    one = record(["y"], ["u"])
+    one = make_record(["y"], ["u"])
     assert assign_record(MODEL, one) == (one, "")
 
 

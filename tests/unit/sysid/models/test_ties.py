@@ -15,9 +15,16 @@ from sysid.models.catalogue.load import load_model
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.estimates import Estimate
-from tests.models import PARAMETERS, difference, differential, individuals, lag_element, record
-from tests.searching import DUFFING, noisy
-from tests.searching import record as duffing_record
+from tests.support.library.search_problems import DUFFING, noisy
+from tests.support.library.search_problems import record as duffing_record
+from tests.support.library.small_models import (
+    PARAMETERS,
+    difference,
+    differential,
+    individuals,
+    lag_element,
+    record,
+)
 
 QUICK = GeneticAlgorithm(population=20, generations=60)
 

@@ -14,7 +14,7 @@ from sysid.models.parse import parse_model
 from sysid.models.units import list_time_unit_warnings
 
 
-def model(equation: str, unit: str, **fields: Any) -> Model:
+def build_model(equation: str, unit: str, **fields: Any) -> Model:
     document = {
         "name": "first",
         "form": "differential",
@@ -36,11 +36,11 @@ def model(equation: str, unit: str, **fields: Any) -> Model:
     ["(K*u - x)/T", "K*u/T - x/(60*T)", "(K*u - x)/(T + 1)", "K*u*exp(-T) - x", "(K*u - x)/-T"],
 )
 def test_a_time_constant_in_minutes_that_is_read_as_it_stands_is_told(equation: str) -> None:
-    [note] = list_time_unit_warnings(model(equation, "min"))
+    [note] = list_time_unit_warnings(build_model(equation, "min"))
     assert note.startswith("T has the unit min, but the equations read it unconverted")
     assert note.endswith("give it in s, or write 60*T.")
-    assert list_time_unit_warnings(model(equation, "s")) == []
-    assert list_time_unit_warnings(model(equation, "V")) == []
+    assert list_time_unit_warnings(build_model(equation, "s")) == []
+    assert list_time_unit_warnings(build_model(equation, "V")) == []
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_a_time_constant_in_minutes_that_is_read_as_it_stands_is_told(equation: 
     ],
 )
 def test_one_that_is_converted_is_not(equation: str) -> None:
-    assert list_time_unit_warnings(model(equation, "min")) == []
+    assert list_time_unit_warnings(build_model(equation, "min")) == []
 
 
 @pytest.mark.parametrize(
@@ -73,12 +73,12 @@ def test_of_a_ratio_of_two_times_nothing_is_to_be_converted(
 ) -> None:
     span = {"lower": 0.01, "upper": 5}
     both = {"T": span | {"unit": "min"}, "S": span | {"unit": other}, "K": span}
-    notes = list_time_unit_warnings(model(equation, "min", parameters=both))
+    notes = list_time_unit_warnings(build_model(equation, "min", parameters=both))
     assert [note.partition(" ")[0] for note in notes] == told
 
 
 def test_a_recursion_may_count_in_what_it_likes() -> None:
-    recursion = model("x(k-1)*T + K*u", "min", form="difference")
+    recursion = build_model("x(k-1)*T + K*u", "min", form="difference")
     assert list_time_unit_warnings(recursion) == []
 
 
@@ -93,5 +93,5 @@ def test_a_result_tells_it() -> None:
     u = Channel("u", times, np.sign(np.sin(times)), "V", hold="zero")
     y = Channel("y", times, np.sin(times - 0.5), "V")
     settings = GeneticAlgorithm(islands=1, stop=Stop(evaluations=200))
-    found = identify(model("(K*u - x)/T", "ms"), Record((u,), (y,)), settings)
+    found = identify(build_model("(K*u - x)/T", "ms"), Record((u,), (y,)), settings)
     assert any("write 0.001*T" in text for text in found.warnings)

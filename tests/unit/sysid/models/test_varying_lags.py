@@ -39,29 +39,29 @@ TIMES = 0.05 * np.arange(300)
 FLOW = 1.0 + 0.5 * np.sin(0.7 * TIMES)
 
 
-def record(flow: FloatArray, values: FloatArray | None = None) -> Record:
+def make_record(flow: FloatArray, values: FloatArray | None = None) -> Record:
     steps = np.where(TIMES % 4 < 2, 0.0, 1.0) * (TIMES > 1)
     inputs = (Channel("u", TIMES, steps, hold="zero"), Channel("q", TIMES, flow, hold="first"))
     return Record(inputs, (Channel("y", TIMES, np.sin(TIMES) if values is None else values),))
 
 
-def piped(**changes: Any) -> Model:
+def make_pipe(**changes: Any) -> Model:
     return parse_model(PIPE | changes)
 
 
 def test_the_volume_of_a_pipe_is_found_from_a_record_with_a_varying_flow() -> None:
     truth = {"V": 0.6, "T": 0.3}
-    data = record(FLOW)
-    clean = simulate(piped(), data.inputs, truth, times=TIMES).channel("y").values
+    data = make_record(FLOW)
+    clean = simulate(make_pipe(), data.inputs, truth, times=TIMES).channel("y").values
     noisy = clean + np.random.default_rng(2).normal(0, 0.01, TIMES.size)
     small = sysid.GeneticAlgorithm(population=20, generations=40, islands=1)
-    found = sysid.identify(piped(), [record(FLOW, noisy)], small)
+    found = sysid.identify(make_pipe(), [make_record(FLOW, noisy)], small)
     for estimate in found.parameters:
         assert estimate.stderr is not None
         assert abs(estimate.value - truth[estimate.name]) < 4 * estimate.stderr
     # The flow swings by a factor of three: a constant lag cannot do that.
-    constant = piped(equations={"x": "(u(t - V) - x)/T"})
-    assert sysid.identify(constant, [record(FLOW, noisy)], small).rms > 3 * found.rms
+    constant = make_pipe(equations={"x": "(u(t - V) - x)/T"})
+    assert sysid.identify(constant, [make_record(FLOW, noisy)], small).rms > 3 * found.rms
 
 
 @pytest.mark.parametrize(
@@ -74,9 +74,11 @@ def test_the_volume_of_a_pipe_is_found_from_a_record_with_a_varying_flow() -> No
 )
 def test_a_flow_that_stops_or_turns_is_refused_with_its_range(flow: FloatArray, part: str) -> None:
     with pytest.raises(InvalidRecord, match=part):
-        Problem.build(piped(), [record(flow)])
-    limited = piped(equations={"x": "(u(t - V/max(q, 0.2)) - x)/T"})
-    assert np.isfinite(Problem.build(limited, [record(flow)]).evaluate_fitness(np.ones((1, 2))))
+        Problem.build(make_pipe(), [make_record(flow)])
+    limited = make_pipe(equations={"x": "(u(t - V/max(q, 0.2)) - x)/T"})
+    assert np.isfinite(
+        Problem.build(limited, [make_record(flow)]).evaluate_fitness(np.ones((1, 2)))
+    )
 
 
 def test_a_lag_longer_than_the_record_is_refused_with_the_range_of_the_flow() -> None:
@@ -84,7 +86,7 @@ def test_a_lag_longer_than_the_record_is_refused_with_the_range_of_the_flow() ->
         RecordTooShort,
         match=r"the upper bound of V is 1 m3 and q goes from 0\.05 to .*smaller upper bound of V",
     ):
-        Problem.build(piped(), [record(0.1 * FLOW)])
+        Problem.build(make_pipe(), [make_record(0.1 * FLOW)])
 
 
 @pytest.mark.parametrize(
@@ -100,7 +102,7 @@ def test_a_lag_longer_than_the_record_is_refused_with_the_range_of_the_flow() ->
 )
 def test_what_a_varying_lag_may_not_read_is_named(equation: str, part: str) -> None:
     with pytest.raises(InvalidModel, match=part):
-        piped(equations={"x": equation}, let={"late": "u(t - V/q)", "state": "2*x"})
+        make_pipe(equations={"x": equation}, let={"late": "u(t - V/q)", "state": "2*x"})
 
 
 @pytest.mark.parametrize(
@@ -117,19 +119,19 @@ def test_a_lag_whose_units_are_no_seconds_is_refused(
     percent = PIPE["parameters"] | {"D": {"lower": 0, "upper": 1, "unit": "%"}}
     hourly = {"inputs": {"u": "degC", "q": "m3/h"}, "parameters": percent}
     with pytest.raises(InvalidModel) as caught:
-        piped(**hourly, equations={"x": equation})
+        make_pipe(**hourly, equations={"x": equation})
     [fault] = caught.value.faults
     assert fault.pointer == place
     assert f"found {found!r}" in fault.detail
     assert cure in fault.detail
-    assert piped(**hourly, equations={"x": "u(t - 3600*V/q) - x/T"}).name == "pipe"
+    assert make_pipe(**hourly, equations={"x": "u(t - 3600*V/q) - x/T"}).name == "pipe"
     unknown = hourly | {"inputs": {"u": "degC", "q": "1"}}
-    assert piped(**unknown, equations={"x": "u(t - V/q) - x/T"}).name == "pipe"
+    assert make_pipe(**unknown, equations={"x": "u(t - V/q) - x/T"}).name == "pipe"
 
 
 def test_the_column_of_a_varying_lag_of_a_name_is_that_of_the_name() -> None:
     with pytest.raises(InvalidModel) as caught:
-        piped(equations={"x": "-x/T + late(t - T)"}, let={"late": "u(t - V/q)"})
+        make_pipe(equations={"x": "-x/T + late(t - T)"}, let={"late": "u(t - V/q)"})
     assert [fault.column for fault in caught.value.faults] == [8]
 
 
@@ -146,6 +148,6 @@ def test_a_polynomial_a_loop_and_a_transfer_function_need_constant_lags() -> Non
         parse_model(polynomial)
     control = PidControl(output="y", input="u", gain=1.0)
     with pytest.raises(InvalidSettings, match="a lag that changes with an input"):
-        LoopDocumentBuilder(piped(), control, 0.05)
+        LoopDocumentBuilder(make_pipe(), control, 0.05)
     with pytest.raises(NotLinear, match="with a lag that changes with an input"):
-        sysid.export_model(piped(), {"V": 0.6, "T": 0.3}, "control")
+        sysid.export_model(make_pipe(), {"V": 0.6, "T": 0.3}, "control")

@@ -21,10 +21,10 @@ from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.profile_likelihood import compute_profile
-from tests import searching
-from tests.profiles import PROFILE, draw_seeds
-from tests.rates import bound_count, bound_mean
-from tests.unit.sysid.residuals.test_coloured import coloured
+from tests.support.library import search_problems
+from tests.support.profiles import PROFILE, draw_seeds
+from tests.support.random_bounds import bound_count, bound_mean
+from tests.unit.sysid.residuals.test_coloured import colour_noise
 
 GAIN = {
     "name": "gain",
@@ -41,16 +41,16 @@ AR1 = Loss(noise_model="ar1")
 SMALL = GeneticAlgorithm(population=24, generations=20)
 
 
-def record(seed: int, pole: float = POLE, kept: FloatArray | None = None) -> Record:
+def make_record(seed: int, pole: float = POLE, kept: FloatArray | None = None) -> Record:
     """y = 2 u + 1 + noise of sd 0.2, with a u that is white."""
     times = STEP * np.arange(N)
     u = np.random.default_rng([seed, 1]).choice([-1.0, 1.0], N)
-    y = 2.0 * u + 1.0 + 0.2 * coloured(N, pole, seed)
+    y = 2.0 * u + 1.0 + 0.2 * colour_noise(N, pole, seed)
     here = np.ones(N, dtype=bool) if kept is None else kept.astype(bool)
     return Record((Channel("u", times, u),), (Channel("y", times[here], y[here]),))
 
 
-def posed(*records: Record, loss: Loss = AR1) -> Problem:
+def build_problem(*records: Record, loss: Loss = AR1) -> Problem:
     return Problem.build(load_model(GAIN), records, loss=loss, skip=1)
 
 
@@ -60,7 +60,7 @@ def squares(problem: Problem) -> FloatArray:
     return end.theta
 
 
-def regression(problem: Problem, white: Whitening) -> FloatArray:
+def fit_regression(problem: Problem, white: Whitening) -> FloatArray:
     """The generalised least-squares estimate of this linear model, in closed form."""
     base = problem.predict(np.zeros((1, 2)))[0]
     columns = (problem.predict(np.eye(2)) - base).T
@@ -79,11 +79,11 @@ def test_whitening_takes_the_correlation_out_of_first_order_noise_at_any_times()
 
 
 def test_estimates_are_those_of_generalised_least_squares_in_closed_form() -> None:
-    problem = posed(record(1), record(2))
+    problem = build_problem(make_record(1), make_record(2))
     found = fit_generalised_least_squares(problem, squares(problem), np.zeros((2, 2)), 1)
     assert found.is_complete
     white = make_whitening(problem, found.correlation_times)
-    np.testing.assert_allclose(found.theta, regression(problem, white), rtol=1e-5)
+    np.testing.assert_allclose(found.theta, fit_regression(problem, white), rtol=1e-5)
 
 
 def test_the_correlation_time_is_found_with_and_without_missing_samples() -> None:
@@ -93,7 +93,7 @@ def test_the_correlation_time_is_found_with_and_without_missing_samples() -> Non
     for chosen in (None, kept):
         found = []
         for seed in draw_seeds(gate=20, night=200):
-            problem = posed(record(seed, 0.8, chosen))
+            problem = build_problem(make_record(seed, 0.8, chosen))
             end = fit_generalised_least_squares(problem, squares(problem), np.zeros((2, 2)), 1)
             found.append(end.correlation_times["y"])
         assert np.mean(found) == pytest.approx(true, rel=0.15)
@@ -105,8 +105,8 @@ def test_the_correlation_time_counts_the_noise_that_parameters_absorb() -> None:
     u = np.sin(2 * np.pi * np.arange(n) / n)  # as slow as the noise
     found = []
     for seed in draw_seeds(gate=40, night=200):
-        y = 2.0 * u + 1.0 + 0.2 * coloured(n, pole, seed)
-        problem = posed(Record((Channel("u", times, u),), (Channel("y", times, y),)))
+        y = 2.0 * u + 1.0 + 0.2 * colour_noise(n, pole, seed)
+        problem = build_problem(Record((Channel("u", times, u),), (Channel("y", times, y),)))
         end = fit_generalised_least_squares(problem, squares(problem), np.zeros((2, 2)), 1)
         found.append(end.correlation_times["y"])
     true = -STEP / np.log(pole)
@@ -115,12 +115,12 @@ def test_the_correlation_time_counts_the_noise_that_parameters_absorb() -> None:
 
 def test_a_long_record_says_more_of_the_correlation_time_than_a_short_one() -> None:
     short = (np.arange(N) < 60).astype(np.float64)
-    records = record(1), record(2, 0.5, short)
-    together = posed(*records)
+    records = make_record(1), make_record(2, 0.5, short)
+    together = build_problem(*records)
     found = fit_generalised_least_squares(together, squares(together), np.zeros((2, 2)), 1)
     alone = []
     for one in records:
-        problem = posed(one)
+        problem = build_problem(one)
         end = fit_generalised_least_squares(problem, squares(problem), np.zeros((2, 2)), 1)
         alone.append(end.correlation_times["y"])
     assert alone[0] > 5 * alone[1] > 0
@@ -130,7 +130,7 @@ def test_a_long_record_says_more_of_the_correlation_time_than_a_short_one() -> N
 
 @pytest.mark.parametrize("unit", [2.0**40, 2.0**-40])
 def test_estimates_under_slow_noise_do_not_depend_on_the_inputs_unit(unit: float) -> None:
-    data = record(4)
+    data = make_record(4)
     (u,) = data.inputs
     other = replace(data, inputs=(replace(u, values=u.values * unit),))
     bounds = {"g": {"lower": -10.0 / unit, "upper": 10.0 / unit}}
@@ -144,7 +144,7 @@ def test_estimates_under_slow_noise_do_not_depend_on_the_inputs_unit(unit: float
 def test_under_slow_noise_a_fast_input_tells_more_than_squares_make_of_it() -> None:
     errors = []
     for seed in draw_seeds(gate=20, night=200):
-        problem = posed(record(seed))
+        problem = build_problem(make_record(seed))
         plain = squares(problem)
         found = fit_generalised_least_squares(problem, plain, np.zeros((2, 2)), 1)
         errors.append([plain[0] - 2.0, found.theta[0] - 2.0])
@@ -155,7 +155,9 @@ def test_under_slow_noise_a_fast_input_tells_more_than_squares_make_of_it() -> N
 def test_intervals_under_first_order_noise_hold_the_truth() -> None:
     held, deviations, colours = [], [], []
     for seed in draw_seeds(gate=12, night=200):
-        found = identify(load_model(GAIN), record(seed, 0.9), SMALL, loss=AR1, skip=1, seed=seed)
+        found = identify(
+            load_model(GAIN), make_record(seed, 0.9), SMALL, loss=AR1, skip=1, seed=seed
+        )
         assert found.noise_sd is not None
         colours.append(found.noise_colour)
         deviations.append(found.noise_sd)
@@ -170,7 +172,8 @@ def test_intervals_under_first_order_noise_hold_the_truth() -> None:
 
 def test_the_likelihood_tells_that_the_noise_model_is_the_better_one() -> None:
     plain, found = (
-        identify(load_model(GAIN), record(3), SMALL, loss=loss, skip=1) for loss in (Loss(), AR1)
+        identify(load_model(GAIN), make_record(3), SMALL, loss=loss, skip=1)
+        for loss in (Loss(), AR1)
     )
     assert plain.criteria is not None
     assert found.criteria is not None
@@ -181,7 +184,8 @@ def test_the_likelihood_tells_that_the_noise_model_is_the_better_one() -> None:
 
 def test_residuals_are_tested_without_what_the_noise_model_explains() -> None:
     plain, found = (
-        identify(load_model(GAIN), record(3), SMALL, loss=loss, skip=1) for loss in (Loss(), AR1)
+        identify(load_model(GAIN), make_record(3), SMALL, loss=loss, skip=1)
+        for loss in (Loss(), AR1)
     )
     assert plain.residual_tests is not None
     assert found.residual_tests is not None
@@ -191,7 +195,7 @@ def test_residuals_are_tested_without_what_the_noise_model_explains() -> None:
 
 def test_white_residuals_leave_everything_as_it_is() -> None:
     plain, found = (
-        identify(load_model(GAIN), record(3, 0.0), SMALL, loss=loss, skip=1)
+        identify(load_model(GAIN), make_record(3, 0.0), SMALL, loss=loss, skip=1)
         for loss in (Loss(), AR1)
     )
     assert [replace(one) for one in found.parameters] == list(plain.parameters)
@@ -200,7 +204,9 @@ def test_white_residuals_leave_everything_as_it_is() -> None:
 
 
 def test_of_a_rough_loss_intervals_hold_the_minima_that_the_noise_does_not_rule_out() -> None:
-    data = searching.record(searching.clean("coulomb-eq16") + 0.02 * coloured(300, 0.9, 2))
+    data = search_problems.record(
+        search_problems.clean("coulomb-eq16") + 0.02 * colour_noise(300, 0.9, 2)
+    )
     problem = Problem.build(load_model("coulomb-eq16"), [data], loss=AR1)
     settings = GeneticAlgorithm(stop=Stop(evaluations=30_000))
     found = conclude_run(
@@ -223,7 +229,7 @@ def test_of_a_rough_loss_intervals_hold_the_minima_that_the_noise_does_not_rule_
 
 def test_a_budget_that_does_not_suffice_is_told_and_kept() -> None:
     settings = replace(SMALL, stop=Stop(evaluations=130, settled=None))
-    found = identify(load_model(GAIN), record(3), settings, loss=AR1, skip=1)
+    found = identify(load_model(GAIN), make_record(3), settings, loss=AR1, skip=1)
     assert found.evaluations <= 130
     assert any("not estimated completely" in text for text in found.warnings)
 
@@ -231,7 +237,7 @@ def test_a_budget_that_does_not_suffice_is_told_and_kept() -> None:
 def test_a_noise_model_gets_the_time_that_is_left_and_no_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    problem = posed(record(3))
+    problem = build_problem(make_record(3))
     timed = replace(SMALL, stop=Stop(seconds=100.0, settled=None))
     state = advance_run(problem, timed, begin_run(problem, timed, 1))
     whole = conclude_run(problem, timed, replace(state, seconds=1.0))
@@ -254,9 +260,9 @@ def test_what_a_noise_model_cannot_do_is_refused() -> None:
     with pytest.raises(InvalidSettings, match="auto, white or ar1"):
         Loss(noise_model="pink")  # type: ignore[arg-type]
     with pytest.raises(InvalidSettings, match="for free runs"):
-        Problem.build(load_model(GAIN), [record(1)], loss=AR1, prediction="one-step")
+        Problem.build(load_model(GAIN), [make_record(1)], loss=AR1, prediction="one-step")
     with pytest.raises(InvalidSettings, match="profiles are of plain squares"):
-        compute_profile(posed(record(1)), np.array([2.0, 1.0]), "g")
+        compute_profile(build_problem(make_record(1)), np.array([2.0, 1.0]), "g")
 
 
 def test_every_output_has_a_noise_of_its_own_and_a_kept_part_is_judged() -> None:
@@ -264,7 +270,7 @@ def test_every_output_has_a_noise_of_its_own_and_a_kept_part_is_judged() -> None
     times = STEP * np.arange(N)
     u = np.random.default_rng(1).choice([-1.0, 1.0], N)
     y = 2.0 * u + 1.0
-    slow, white = coloured(N, 0.95, 1), coloured(N, 0.0, 2)
+    slow, white = colour_noise(N, 0.95, 1), colour_noise(N, 0.0, 2)
     data = Record(
         (Channel("u", times, u),),
         (Channel("y", times, y + 0.2 * slow), Channel("z", times, 2.0 * y + 0.2 * white)),
@@ -277,7 +283,7 @@ def test_every_output_has_a_noise_of_its_own_and_a_kept_part_is_judged() -> None
     assert {one.output for one in found.residual_tests.tests} == {"y", "z"}
 
 
-def advised(u: FloatArray, y: FloatArray) -> list[str]:
+def list_advice(u: FloatArray, y: FloatArray) -> list[str]:
     times = STEP * np.arange(u.size)
     one = Record((Channel("u", times, u, hold="first"),), (Channel("y", times, y),))
     told = identify(load_model(GAIN), one, SMALL, skip=1).warnings
@@ -286,9 +292,9 @@ def advised(u: FloatArray, y: FloatArray) -> list[str]:
 
 def test_slow_noise_is_told_with_its_remedy_also_without_a_lag() -> None:
     u = np.random.default_rng([3, 1]).choice([-1.0, 1.0], N)
-    (text,) = advised(u, 2.0 * u + 1.0 + 0.2 * coloured(N, POLE, 3))
+    (text,) = list_advice(u, 2.0 * u + 1.0 + 0.2 * colour_noise(N, POLE, 3))
     assert "slow noise of y" in text
-    assert not advised(u, 2.0 * u + 1.0 + 0.2 * coloured(N, 0.0, 3))
+    assert not list_advice(u, 2.0 * u + 1.0 + 0.2 * colour_noise(N, 0.0, 3))
 
 
 def test_no_noise_model_is_advised_where_the_residuals_are_dynamics() -> None:
@@ -296,4 +302,4 @@ def test_no_noise_model_is_advised_where_the_residuals_are_dynamics() -> None:
     y, pole = np.zeros(N), 0.8
     for k in range(1, N):
         y[k] = pole * y[k - 1] + (1.0 - pole) * 2.0 * u[k - 1]
-    assert not advised(u, y + 0.01 * coloured(N, 0.0, 3))
+    assert not list_advice(u, y + 0.01 * colour_noise(N, 0.0, 3))

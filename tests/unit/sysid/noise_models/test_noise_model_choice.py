@@ -15,8 +15,8 @@ from sysid.noise_models.noise_model_choice import compare_on_blocks
 from sysid.results.identification import Identification
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.profile_likelihood import compute_profile
-from tests.models import LINE
-from tests.unit.sysid.residuals.test_coloured import coloured
+from tests.support.library.small_models import LINE
+from tests.unit.sysid.residuals.test_coloured import colour_noise
 
 STEP, N = 0.1, 400
 AUTO, WHITE, AR1 = (Loss(noise_model=name) for name in ("auto", "white", "ar1"))
@@ -41,19 +41,19 @@ LAG = {
 }
 
 
-def signal(seed: int = 1, n: int = N) -> FloatArray:
+def make_signal(seed: int = 1, n: int = N) -> FloatArray:
     return np.repeat(np.random.default_rng([seed, 1]).choice([-1.0, 2.0], n // 10), 10)
 
 
-def record(y: FloatArray, u: FloatArray | None = None) -> Record:
+def make_record(y: FloatArray, u: FloatArray | None = None) -> Record:
     times = STEP * np.arange(y.size)
-    u = signal(n=y.size) if u is None else u
+    u = make_signal(n=y.size) if u is None else u
     return Record((Channel("u", times, u),), (Channel("y", times, y),))
 
 
-def plant(rate: float, disturbance: FloatArray) -> FloatArray:
+def build_plant(rate: float, disturbance: FloatArray) -> FloatArray:
     """x' = K u - o - rate x + disturbance, from 0 on."""
-    u, x = signal(n=disturbance.size), np.zeros(disturbance.size)
+    u, x = make_signal(n=disturbance.size), np.zeros(disturbance.size)
     for k in range(1, x.size):
         gain = rate if rate > 0 else 1.0
         flow = gain * (K * u[k - 1] - OFFSET) - rate * x[k - 1]
@@ -61,20 +61,22 @@ def plant(rate: float, disturbance: FloatArray) -> FloatArray:
     return x
 
 
-def disturbed(seed: int, rate: float = 0.0) -> FloatArray:
+def simulate_disturbed(seed: int, rate: float = 0.0) -> FloatArray:
     """Output of the plant under a random inflow."""
-    return plant(rate, coloured(N, 0.5, seed)) + 0.01 * coloured(N, 0.0, seed + 100)
+    return build_plant(rate, colour_noise(N, 0.5, seed)) + 0.01 * colour_noise(N, 0.0, seed + 100)
 
 
-def delayed(seed: int) -> FloatArray:
+def simulate_delayed(seed: int) -> FloatArray:
     """Output of the lag with a dead time, whose misfit whitening moves to low frequencies."""
-    late = np.concatenate([np.zeros(8), plant(1.0 / T, np.zeros(N))[:-8]])
-    return np.asarray(late + 0.01 * coloured(N, 0.0, seed))
+    late = np.concatenate([np.zeros(8), build_plant(1.0 / T, np.zeros(N))[:-8]])
+    return np.asarray(late + 0.01 * colour_noise(N, 0.0, seed))
 
 
-def found(model: dict[str, Any], y: FloatArray, loss: Loss, **options: Any) -> Identification:
+def identify_plant(
+    model: dict[str, Any], y: FloatArray, loss: Loss, **options: Any
+) -> Identification:
     settings = options.pop("settings", SMALL)
-    return identify(load_model(model), record(y), settings, loss=loss, **options)
+    return identify(load_model(model), make_record(y), settings, loss=loss, **options)
 
 
 def same(one: Identification, other: Identification) -> bool:
@@ -90,8 +92,8 @@ def same(one: Identification, other: Identification) -> bool:
 
 @pytest.mark.parametrize("seed", [2, 3, 5])
 def test_a_drift_of_an_integrator_is_taken_for_noise_and_squares_are_told(seed: int) -> None:
-    y = disturbed(seed)
-    auto, white, ar1 = (found(TANK, y, loss) for loss in (AUTO, WHITE, AR1))
+    y = simulate_disturbed(seed)
+    auto, white, ar1 = (identify_plant(TANK, y, loss) for loss in (AUTO, WHITE, AR1))
     assert auto.noise_model == "ar1"
     assert auto.parameters == ar1.parameters
     assert auto.correlation_times == ar1.correlation_times
@@ -104,7 +106,9 @@ def test_a_drift_of_an_integrator_is_taken_for_noise_and_squares_are_told(seed: 
 
 @pytest.mark.parametrize("seed", [2, 3, 5])
 def test_dynamics_that_the_model_lacks_are_left_to_squares(seed: int) -> None:
-    auto, white, ar1 = (found(LAG, delayed(seed), loss) for loss in (AUTO, WHITE, AR1))
+    auto, white, ar1 = (
+        identify_plant(LAG, simulate_delayed(seed), loss) for loss in (AUTO, WHITE, AR1)
+    )
     assert ar1.correlation_times["y"] > 0
     assert auto.parameters == white.parameters
     assert auto.warnings == white.warnings
@@ -113,9 +117,9 @@ def test_dynamics_that_the_model_lacks_are_left_to_squares(seed: int) -> None:
 
 def test_blocks_are_predicted_from_the_others() -> None:
     """Against least squares of a line through all samples but those of a block."""
-    y = 0.8 * signal() - 0.3 + coloured(N, 0.9, 4)
-    problem = Problem.build(load_model(LINE), [record(y)])
-    columns = np.column_stack([signal(), np.ones(N)])
+    y = 0.8 * make_signal() - 0.3 + colour_noise(N, 0.9, 4)
+    problem = Problem.build(load_model(LINE), [make_record(y)])
+    columns = np.column_stack([make_signal(), np.ones(N)])
     theta = np.linalg.lstsq(columns, y, rcond=None)[0]
     errors = compare_on_blocks(problem, theta)
     assert errors is not None
@@ -132,15 +136,18 @@ def test_blocks_are_predicted_from_the_others() -> None:
 
 def test_validation_data_decide_where_there_are_any() -> None:
     """The same record with data that one or the other predicts better."""
-    y = disturbed(2)
-    white, ar1 = (found(TANK, y, loss) for loss in (WHITE, AR1))
+    y = simulate_disturbed(2)
+    white, ar1 = (identify_plant(TANK, y, loss) for loss in (WHITE, AR1))
     for better in (white, ar1):
         values = [one.value for one in better.parameters]
-        problem = Problem.build(load_model(TANK), [record(y)])
-        other = record(problem.predict(np.array([values]))[0])
-        auto = found(TANK, y, AUTO, validation=other)
+        problem = Problem.build(load_model(TANK), [make_record(y)])
+        other = make_record(problem.predict(np.array([values]))[0])
+        auto = identify_plant(TANK, y, AUTO, validation=other)
         assert auto.noise_model == better.noise_model
-        assert auto.parameters == found(TANK, y, better_loss(better), validation=other).parameters
+        assert (
+            auto.parameters
+            == identify_plant(TANK, y, better_loss(better), validation=other).parameters
+        )
 
 
 def better_loss(found: Identification) -> Loss:
@@ -151,8 +158,8 @@ def better_loss(found: Identification) -> Loss:
 @pytest.mark.parametrize("sd", [0.0, 1e-9, 0.05])
 def test_white_noise_and_no_noise_change_nothing(model: dict[str, Any], sd: float) -> None:
     rate = 0.0 if model is TANK else 1.0 / T
-    y = plant(rate, np.zeros(N)) + sd * coloured(N, 0.0, 7)
-    auto, white = (found(model, y, loss) for loss in (AUTO, WHITE))
+    y = build_plant(rate, np.zeros(N)) + sd * colour_noise(N, 0.0, 7)
+    auto, white = (identify_plant(model, y, loss) for loss in (AUTO, WHITE))
     assert same(auto, white)
     assert auto.warnings == white.warnings
 
@@ -174,10 +181,10 @@ def test_too_long_a_step_of_the_integration_is_told_and_not_taken_for_noise() ->
         "solver": {"method": "rk4", "step": "sample"},
     }
     fine = {**stiff, "solver": {"method": "rk4", "step": "sample", "substeps": 40}}
-    true = Problem.build(load_model(fine), [record(np.zeros(N))])
+    true = Problem.build(load_model(fine), [make_record(np.zeros(N))])
     y = true.predict(np.array([[K, 3.0, 1.0]]))[0]
     y = y + 1e-5 * np.random.default_rng(1).standard_normal(y.size)
-    auto, white, ar1 = (found(stiff, y, loss) for loss in (AUTO, WHITE, AR1))
+    auto, white, ar1 = (identify_plant(stiff, y, loss) for loss in (AUTO, WHITE, AR1))
     assert not ar1.correlation_times  # nothing of the step is left in the residuals
     assert same(auto, white)
     assert auto.warnings == white.warnings
@@ -188,7 +195,9 @@ def test_too_long_a_step_of_the_integration_is_told_and_not_taken_for_noise() ->
 @pytest.mark.parametrize("most", [130, 160, 300])
 def test_a_budget_that_does_not_suffice_leaves_squares(most: int) -> None:
     tight = replace(SMALL, stop=Stop(evaluations=most, settled=None))
-    auto, white = (found(TANK, disturbed(2), loss, settings=tight) for loss in (AUTO, WHITE))
+    auto, white = (
+        identify_plant(TANK, simulate_disturbed(2), loss, settings=tight) for loss in (AUTO, WHITE)
+    )
     assert auto.parameters == white.parameters
     assert auto.warnings == white.warnings
     assert auto.evaluations <= most
@@ -203,22 +212,26 @@ def test_a_budget_that_does_not_suffice_leaves_squares(most: int) -> None:
     ],
 )
 def test_what_has_no_noise_model_is_as_with_white(options: dict[str, Any]) -> None:
-    auto, white = (found(TANK, disturbed(2), loss, **options) for loss in (AUTO, WHITE))
+    auto, white = (
+        identify_plant(TANK, simulate_disturbed(2), loss, **options) for loss in (AUTO, WHITE)
+    )
     assert same(auto, white)
     assert auto.warnings == white.warnings
 
 
 def test_a_robust_loss_stays_without_noise_model() -> None:
-    y = disturbed(2)
-    auto, white = (found(TANK, y, Loss("soft-l1", 0.1, name)) for name in ("auto", "white"))
+    y = simulate_disturbed(2)
+    auto, white = (
+        identify_plant(TANK, y, Loss("soft-l1", 0.1, name)) for name in ("auto", "white")
+    )
     assert same(auto, white)
 
 
 def test_profiles_are_of_squares_whatever_was_chosen() -> None:
-    y = disturbed(2)
+    y = simulate_disturbed(2)
     told = []
     for loss in (AUTO, WHITE):
-        problem = Problem.build(load_model(TANK), [record(y)], loss=loss)
+        problem = Problem.build(load_model(TANK), [make_record(y)], loss=loss)
         told.append(compute_profile(problem, np.array([K, OFFSET]), "K", 5))
     assert told[0].estimate == told[1].estimate
     assert told[0].interval == told[1].interval

@@ -17,7 +17,7 @@ N = 120
 TIMES = 0.5 * np.arange(N)
 
 
-def coloured(seed: int) -> FloatArray:
+def colour_noise(seed: int) -> FloatArray:
     noise = np.random.default_rng(seed).normal(size=N)
     for k in range(1, N):
         noise[k] += 0.6 * noise[k - 1]
@@ -32,7 +32,7 @@ def gaps(share: float) -> BoolArray:
 
 @pytest.mark.parametrize("share", [0.0, 0.2])
 def test_the_statistic_of_whiteness_is_that_of_ljung_and_box(share: float) -> None:
-    present, e = gaps(share), coloured(0)
+    present, e = gaps(share), colour_noise(0)
     spaced = space_residuals(TIMES[present], e[present])
     e, n = np.where(present, e, 0.0), np.count_nonzero(present)
     found, statistic = compute_whiteness(spaced), 0.0
@@ -61,7 +61,7 @@ def weigh_autocovariance(e: FloatArray, present: BoolArray) -> FloatArray:
 @pytest.mark.parametrize("share", [0.0, 0.05])
 def test_the_covariance_of_two_sums_is_that_of_the_windowed_autocovariance(share: float) -> None:
     present = gaps(share)
-    e = np.where(present, coloured(1), 0.0)
+    e = np.where(present, colour_noise(1), 0.0)
     u = np.random.default_rng(2).normal(size=N + 20)
     channel = Channel("u", 0.5 * (np.arange(N + 20) - 20), u)
     spaced = space_residuals(TIMES[present], e[present])

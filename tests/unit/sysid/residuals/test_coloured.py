@@ -16,9 +16,9 @@ from sysid.residuals.sandwich import Sandwich, estimate_sandwich, estimate_spect
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
-from tests.profiles import draw_seeds
-from tests.rates import bound_count, bound_mean
-from tests.searching import DUFFING, noisy, record
+from tests.support.library.search_problems import DUFFING, noisy, record
+from tests.support.profiles import draw_seeds
+from tests.support.random_bounds import bound_count, bound_mean
 
 STEADY = {
     "name": "level",
@@ -33,7 +33,7 @@ STEADY = {
 N, POLE = 2000, 0.8
 
 
-def coloured(n: int, pole: float, seed: int) -> FloatArray:
+def colour_noise(n: int, pole: float, seed: int) -> FloatArray:
     """First-order noise of variance 1."""
     white = np.random.default_rng(seed).standard_normal(n + 200)
     noise = np.zeros(n + 200)
@@ -58,7 +58,7 @@ def standard_error(analysis: Analysis) -> float:
 
 @pytest.mark.parametrize("pole", [POLE, -0.5])
 def test_the_standard_error_of_a_mean_is_that_of_its_long_run_variance(pole: float) -> None:
-    found = [level(coloured(N, pole, seed)) for seed in draw_seeds(gate=20, night=200)]
+    found = [level(colour_noise(N, pole, seed)) for seed in draw_seeds(gate=20, night=200)]
     theory = np.sqrt((1 + pole) / (1 - pole) / N)
     errors = [standard_error(one) for one in found]
     assert np.mean(errors) == pytest.approx(theory, abs=bound_mean(errors, 0.08 * theory))
@@ -74,19 +74,19 @@ def test_of_white_residuals_the_covariance_is_the_plain_one() -> None:
 
 
 def test_one_step_ahead_residuals_keep_the_plain_covariance() -> None:
-    found = level(coloured(N, POLE, 0), prediction="one-step")
+    found = level(colour_noise(N, POLE, 0), prediction="one-step")
     assert found.uncertainty is not None
     assert found.uncertainty.noise_colour == "white"
 
 
 def test_a_robust_loss_is_allowed_for_as_squares_are() -> None:
-    noise = coloured(N, POLE, 0)
+    noise = colour_noise(N, POLE, 0)
     squares, robust = level(noise), level(noise, loss=Loss("soft-l1", 10.0))
     assert standard_error(robust) == pytest.approx(standard_error(squares), rel=0.1)
 
 
 def test_two_equal_halves_give_what_the_halves_say_together() -> None:
-    noise = coloured(N, POLE, 1)
+    noise = colour_noise(N, POLE, 1)
     times = 0.1 * np.arange(N)
     one = Record((Channel("u", times, times),), (Channel("y", times, noise),))
     both = Problem.build(load_model(STEADY), [one, replace(one)], skip=1)
@@ -106,7 +106,7 @@ def test_residuals_that_wander_over_the_whole_record_are_told_as_such() -> None:
 def test_the_interval_of_a_mean_holds_it_in_short_records(pole: float, n: int) -> None:
     held, seeds = 0, draw_seeds(gate=50, night=1000)
     for seed in seeds:
-        estimate = level(coloured(n, pole, seed)).estimates[0]
+        estimate = level(colour_noise(n, pole, seed)).estimates[0]
         assert estimate.interval95 is not None
         held += estimate.interval95[0] <= 0.0 <= estimate.interval95[1]
     assert held >= bound_count(len(seeds), 0.9)[0]
@@ -120,7 +120,7 @@ def test_intervals_hold_the_truth_where_the_noise_is_coloured() -> None:
     )
     held = []
     for seed in draw_seeds(gate=30, night=500):
-        problem = Problem.build(model, [record(clean + 0.01 * coloured(clean.size, 0.7, seed))])
+        problem = Problem.build(model, [record(clean + 0.01 * colour_noise(clean.size, 0.7, seed))])
         end = refine_candidates(problem, [truth])[0]
         assert end is not None
         found = analyse_estimate(problem, end.theta).uncertainty
@@ -147,7 +147,7 @@ def unequal(
     return problem, np.concatenate([values[1:] for values in noise])
 
 
-def covariance(
+def estimate_covariance(
     lengths: tuple[int, ...], deviations: tuple[float, ...], seed: int = 5
 ) -> Sandwich | None:
     problem, residuals = unequal(lengths, deviations, seed)
@@ -157,14 +157,14 @@ def covariance(
 def test_records_of_one_noise_are_not_taken_for_unequal_however_long_each_is() -> None:
     seeds = draw_seeds(gate=20, night=500)
     for lengths in ((41, 4001), (4001, 41)):
-        equal = sum(covariance(lengths, (1.0, 1.0), seed) is None for seed in seeds)
+        equal = sum(estimate_covariance(lengths, (1.0, 1.0), seed) is None for seed in seeds)
         assert equal >= bound_count(len(seeds), 0.99)[0]
-    assert covariance((41, 4001), (2.5, 1.0)) is not None
+    assert estimate_covariance((41, 4001), (2.5, 1.0)) is not None
 
 
 def test_white_records_of_unequal_noise_have_their_own_variances_and_degrees() -> None:
     lengths, deviations = (101, 401), (4.0, 1.0)
-    found = covariance(lengths, deviations)
+    found = estimate_covariance(lengths, deviations)
     assert found is not None
     assert found.is_white
     _, residuals = unequal(lengths, deviations)

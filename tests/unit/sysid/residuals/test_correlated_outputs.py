@@ -12,8 +12,8 @@ from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
-from tests.profiles import draw_seeds
-from tests.rates import bound_count, bound_mean
+from tests.support.profiles import draw_seeds
+from tests.support.random_bounds import bound_count, bound_mean
 
 TIMES = 0.05 * np.arange(300.0)
 TRUTH = {"a": 2.0, "b": 1.5, "T": 0.6, "L": 0.3}
@@ -38,7 +38,7 @@ U = Channel("u", TIMES, np.repeat(np.random.default_rng(7).normal(size=30), 10),
 CLEAN = simulate(MODEL, [U], TRUTH, times=TIMES).channels
 
 
-def noise(seed: int, correlation: float, pole: float = 0.0) -> FloatArray:
+def draw_noise(seed: int, correlation: float, pole: float = 0.0) -> FloatArray:
     """Noise of two outputs (2, N), of variance 0.01 each."""
     white = np.random.default_rng(seed).standard_normal((2, TIMES.size + 100))
     white[1] = correlation * white[0] + np.sqrt(1 - correlation**2) * white[1]
@@ -46,7 +46,7 @@ def noise(seed: int, correlation: float, pole: float = 0.0) -> FloatArray:
     return np.asarray(found[:, 100:])
 
 
-def analysed(both: FloatArray, late: int = 0) -> Analysis:
+def analyse_outputs(both: FloatArray, late: int = 0) -> Analysis:
     """The analysis at the estimate; the second output is measured from sample `late` on."""
     data = [
         Channel("y", TIMES, CLEAN[0].values + both[0], "m"),
@@ -74,7 +74,9 @@ def test_intervals_cover_the_truth_whatever_outputs_have_in_common(
     correlation: float, pole: float, gate: int
 ) -> None:
     seeds = draw_seeds(gate=gate, night=600)
-    covered = np.array([covers(analysed(noise(seed, correlation, pole))) for seed in seeds])
+    covered = np.array(
+        [covers(analyse_outputs(draw_noise(seed, correlation, pole))) for seed in seeds]
+    )
     # As independent outputs 84 % of T and L for a correlation of 0.9.
     assert np.min(np.sum(covered, axis=0)) >= bound_count(len(seeds), 0.94)[0]
     shares = np.mean(covered, axis=1)
@@ -86,14 +88,14 @@ def test_of_independent_outputs_nothing_is_taken_for_common() -> None:
     data = [Channel(one.name, TIMES, one.values, "m") for one in CLEAN]
     problem = Problem.build(MODEL, [Record((U,), tuple(data))], weights={"y": 1.0, "z": 1.0})
     seeds = draw_seeds(gate=30, night=300)
-    drawn = ([noise(seed, one).ravel() for seed in seeds] for one in (0.0, 0.9))
+    drawn = ([draw_noise(seed, one).ravel() for seed in seeds] for one in (0.0, 0.9))
     free, common = ([estimate_sandwich(problem, e, columns) is None for e in one] for one in drawn)
     assert sum(free) >= bound_count(len(seeds), 0.99)[0]
     assert not any(common)
 
 
 def test_common_noise_makes_what_both_outputs_tell_less_sure() -> None:
-    alone, common = (analysed(noise(1, one)).estimates for one in (0.0, 0.9))
+    alone, common = (analyse_outputs(draw_noise(1, one)).estimates for one in (0.0, 0.9))
     for name in ("T", "L"):
         before, after = (next(e.stderr for e in one if e.name == name) for one in (alone, common))
         assert before is not None
@@ -102,7 +104,7 @@ def test_common_noise_makes_what_both_outputs_tell_less_sure() -> None:
 
 
 def test_only_samples_of_the_same_time_have_their_noise_in_common() -> None:
-    whole, part = (analysed(noise(1, 0.9), late).estimates for late in (0, 150))
+    whole, part = (analyse_outputs(draw_noise(1, 0.9), late).estimates for late in (0, 150))
     assert [e.name for e in whole] == [e.name for e in part]
     assert whole[3].stderr is not None
     assert part[3].stderr is not None
@@ -110,7 +112,7 @@ def test_only_samples_of_the_same_time_have_their_noise_in_common() -> None:
 
 
 def test_it_is_told_as_white_noise() -> None:
-    found = analysed(noise(1, 0.9)).uncertainty
+    found = analyse_outputs(draw_noise(1, 0.9)).uncertainty
     assert found is not None
     assert found.noise_colour == "white"
 
@@ -121,7 +123,7 @@ def test_what_noise_leaves_of_a_difference_is_never_below_nothing(
 ) -> None:
     shares = []
     for seed in draw_seeds(gate=24, night=300):
-        found = analysed(noise(seed, correlation, pole))
+        found = analyse_outputs(draw_noise(seed, correlation, pole))
         for one in found.estimates:
             assert one.stderr is not None
             assert one.stderr >= 0.0  # and a number: the difference of two spectra was below 0
@@ -133,7 +135,7 @@ def test_the_same_noise_in_two_outputs_counts_once() -> None:
     columns = np.random.default_rng(0).standard_normal((2 * TIMES.size, 4))
     data = [Channel(one.name, TIMES, one.values, "m") for one in CLEAN]
     problem = Problem.build(MODEL, [Record((U,), tuple(data))], weights={"y": 1.0, "z": 1.0})
-    found = estimate_sandwich(problem, noise(0, 1.0).ravel(), columns)
+    found = estimate_sandwich(problem, draw_noise(0, 1.0).ravel(), columns)
     assert found is not None
     assert found.equivalent_samples == pytest.approx(TIMES.size)
     assert found.degrees == pytest.approx(TIMES.size - 4)
@@ -145,7 +147,7 @@ def test_the_middle_has_the_cross_terms_of_samples_at_the_same_times(late: int) 
     data = [Channel("y", TIMES, CLEAN[0].values, "m")]
     data += [Channel("z", TIMES[late:], CLEAN[1].values[late:], "m")]
     problem = Problem.build(MODEL, [Record((U,), tuple(data))], weights={"y": 1.0, "z": 1.0})
-    first, second = noise(2, 0.9)
+    first, second = draw_noise(2, 0.9)
     errors = np.concatenate([first, second[late:]])
     columns = draw.standard_normal((errors.size, 4))
     found = estimate_sandwich(problem, errors, columns)

@@ -16,7 +16,9 @@ N, STEP, LATE = 1500, 0.1, 20  # samples, s, samples of dead time
 TIMES = STEP * np.arange(N)
 
 
-def loop(seed: int, reference: FloatArray, quantum: float = 0.0) -> tuple[FloatArray, FloatArray]:
+def simulate_loop(
+    seed: int, reference: FloatArray, quantum: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
     """Input and output of K = 2, T = 8 s, L = 2 s under PI control with a slow disturbance."""
     draws = np.random.default_rng(seed)
     keep, state, total, slow = np.exp(-STEP / 8.0), 0.0, 0.0, 0.0
@@ -32,7 +34,7 @@ def loop(seed: int, reference: FloatArray, quantum: float = 0.0) -> tuple[FloatA
     return u, y
 
 
-def held(u: FloatArray) -> Channel:
+def make_held_input(u: FloatArray) -> Channel:
     return Channel("u", TIMES, u, hold="zero")
 
 
@@ -43,7 +45,7 @@ def series(residual: FloatArray, hidden: int | None = None) -> ResidualSeries:
     return ResidualSeries(0, "y", TIMES, residual, scored, 1.0, ())
 
 
-def delayed(u: FloatArray, gain: float = 2.0) -> FloatArray:
+def simulate_free_run(u: FloatArray, gain: float = 2.0) -> FloatArray:
     """Free run of the plant with a given gain."""
     keep, y = np.exp(-STEP / 8.0), np.zeros(N)
     for k in range(1, N):
@@ -59,12 +61,17 @@ def delayed(u: FloatArray, gain: float = 2.0) -> FloatArray:
 def test_a_loop_is_recognised_with_and_without_reference_and_with_a_poor_model(
     seed: int, quantum: float, height: float, gain: float
 ) -> None:
-    u, y = loop(seed, height * ((TIMES // 15) % 2), quantum)
-    assert compute_explained_share(series(y - delayed(u, gain)), held(u)) > 0.8
-    assert compute_explained_share(series(y - delayed(u, gain), hidden=5), held(u)) > 0.8
+    u, y = simulate_loop(seed, height * ((TIMES // 15) % 2), quantum)
+    assert compute_explained_share(series(y - simulate_free_run(u, gain)), make_held_input(u)) > 0.8
+    assert (
+        compute_explained_share(
+            series(y - simulate_free_run(u, gain), hidden=5), make_held_input(u)
+        )
+        > 0.8
+    )
 
 
-def wave(of: Callable[[FloatArray, np.random.Generator], FloatArray], seed: int) -> FloatArray:
+def make_wave(of: Callable[[FloatArray, np.random.Generator], FloatArray], seed: int) -> FloatArray:
     return of(TIMES, np.random.default_rng(seed))
 
 
@@ -90,21 +97,25 @@ def test_an_open_loop_is_not_taken_for_one_however_poor_the_model(
     name: str, noise: float, hold: Literal["zero", "first"]
 ) -> None:
     for seed in range(3):
-        u = wave(INPUTS[name], seed)
+        u = make_wave(INPUTS[name], seed)
         draws = np.random.default_rng(seed + 9)
-        misfit = delayed(u) - delayed(u, gain=1.0) ** 2 + noise * np.std(u) * draws.normal(size=N)
+        misfit = (
+            simulate_free_run(u)
+            - simulate_free_run(u, gain=1.0) ** 2
+            + noise * np.std(u) * draws.normal(size=N)
+        )
         assert compute_explained_share(series(misfit), Channel("u", TIMES, u, hold=hold)) < 0.3
 
 
 def test_too_short_constant_and_irregular_records_are_not_judged() -> None:
-    u, y = loop(0, np.zeros(N))
-    judged = series(y - delayed(u))
-    assert compute_explained_share(judged, held(np.ones(N))) == 0.0
-    assert compute_explained_share(judged._replace(residual=np.zeros(N)), held(u)) == 0.0
+    u, y = simulate_loop(0, np.zeros(N))
+    judged = series(y - simulate_free_run(u))
+    assert compute_explained_share(judged, make_held_input(np.ones(N))) == 0.0
+    assert compute_explained_share(judged._replace(residual=np.zeros(N)), make_held_input(u)) == 0.0
     short = judged.scored & (TIMES < 5.0)
-    assert compute_explained_share(judged._replace(scored=short), held(u)) == 0.0
+    assert compute_explained_share(judged._replace(scored=short), make_held_input(u)) == 0.0
     uneven = TIMES + 0.04 * np.random.default_rng(0).random(N)
-    assert compute_explained_share(judged._replace(times=uneven), held(u)) == 0.0
+    assert compute_explained_share(judged._replace(times=uneven), make_held_input(u)) == 0.0
 
 
 @pytest.mark.parametrize(("closed", "least", "most"), [("first", 0.0, 0.3), ("last", 0.9, 1.0)])
@@ -122,23 +133,23 @@ def test_of_a_long_record_the_last_5_000_samples_are_judged(
 
 
 def test_a_regulated_record_without_reference_is_warned_of() -> None:
-    u, y = loop(1, np.zeros(N))
-    record = Record((held(u),), (Channel("y", TIMES, y),))
+    u, y = simulate_loop(1, np.zeros(N))
+    record = Record((make_held_input(u),), (Channel("y", TIMES, y),))
 
-    def told(**options: Any) -> str:
+    def read_note(**options: Any) -> str:
         found = identify(load_model("fopdt"), [record], seed=1, **options)
         [note] = [one for one in found.warnings if "closed loop" in one]
         return note
 
-    note = told()
+    note = read_note()
     assert note.startswith("input 'u' follows the residuals of y: they explain")
     assert "use loss=Loss(noise_model='ar1')" in note
-    assert "noise_model" not in told(loss=Loss(noise_model="ar1"))
+    assert "noise_model" not in read_note(loss=Loss(noise_model="ar1"))
     assert describe_feedback([]) == []
 
 
 def test_what_a_model_misses_of_an_input_read_as_straight_is_told_as_another_cause() -> None:
-    u = wave(INPUTS["filtered"], 0)
+    u = make_wave(INPUTS["filtered"], 0)
     keep, y = np.exp(-STEP / 0.3), np.zeros(N)
     for k in range(1, N):  # an open loop: straight from sample to sample, and no dead time
         y[k] = keep * y[k - 1] + (1 - keep) * 0.5 * (u[k] + u[k - 1])

@@ -9,14 +9,14 @@ from sysid.data.records import Channel, Hold, Record
 from sysid.models.catalogue.load import load_model
 from sysid.residuals import onset_delay
 from sysid.residuals.onset_delay import OnsetDelay, estimate_onset_delays, find_unprompted_output
-from tests.needs import DATA
+from tests.support.requirements import DATA
 
 STEP, HOLD = 0.01, 300
 LEVELS = np.array([0.0, 1.0, 0.4, 0.9, 0.1, 0.6])
 K, T, L = 2.0, 0.35, 0.127
 
 
-def response(times: FloatArray, delay: float = L) -> FloatArray:
+def compute_response(times: FloatArray, delay: float = L) -> FloatArray:
     """Exact response of a first-order system behind a delay to the steps of `LEVELS`."""
     y = np.zeros(times.size)
     before = 0.0
@@ -45,12 +45,12 @@ def delays(
     return estimate_onset_delays(load_model("fopdt"), (record,))[0]
 
 
-def steps() -> FloatArray:
+def make_steps() -> FloatArray:
     return np.repeat(LEVELS, HOLD)
 
 
 def test_without_noise_it_is_the_delay_and_two_per_cent_of_the_rise() -> None:
-    found = delays(steps(), response(TIMES))
+    found = delays(make_steps(), compute_response(TIMES))
     assert found.delay == pytest.approx(EXPECTED, abs=0.002)
     assert found.events == LEVELS.size - 1
     assert found.threshold == 0.02
@@ -61,24 +61,24 @@ def test_without_noise_it_is_the_delay_and_two_per_cent_of_the_rise() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_with_noise_it_is_a_few_samples_off_at_most(seed: int) -> None:
     noise = 0.005 * np.random.default_rng(seed).normal(size=TIMES.size)
-    found = delays(steps(), response(TIMES) + noise)
+    found = delays(make_steps(), compute_response(TIMES) + noise)
     assert found.delay == pytest.approx(EXPECTED, abs=0.02)
     assert found.threshold is not None
     assert found.threshold >= 0.02
 
 
 def test_a_later_output_has_a_delay_that_is_longer_by_as_much() -> None:
-    first, later = (delays(steps(), response(TIMES, lag)).delay for lag in (0.1, 0.35))
+    first, later = (delays(make_steps(), compute_response(TIMES, lag)).delay for lag in (0.1, 0.35))
     assert first is not None
     assert later == pytest.approx(first + 0.25, abs=0.003)
 
 
 def test_one_event_that_is_answered_late_does_not_move_it() -> None:
-    late = response(TIMES)
+    late = compute_response(TIMES)
     turn = 3 * HOLD
-    held_back = response(TIMES, L + 0.5)
+    held_back = compute_response(TIMES, L + 0.5)
     late[turn : turn + HOLD] = held_back[turn : turn + HOLD]  # one step of five
-    found = delays(steps(), late)
+    found = delays(make_steps(), late)
     assert found.events == LEVELS.size - 1
     assert found.delay == pytest.approx(EXPECTED, abs=0.002)
     assert found.spread is not None
@@ -94,14 +94,14 @@ def test_a_ramp_of_the_input_is_not_counted_as_delay() -> None:
 def test_missing_and_irregular_samples_of_the_output_do_no_harm() -> None:
     draw = np.random.default_rng(1)
     times = np.sort(draw.uniform(0, TIMES[-1], TIMES.size))
-    y = response(times)
+    y = compute_response(times)
     y[draw.random(times.size) < 0.1] = np.nan
-    assert delays(steps(), y, times=times).delay == pytest.approx(EXPECTED, abs=0.02)
+    assert delays(make_steps(), y, times=times).delay == pytest.approx(EXPECTED, abs=0.02)
 
 
 def test_the_unit_of_neither_signal_matters() -> None:
-    plain = delays(steps(), response(TIMES))
-    other = delays(1e5 * steps() + 3e5, -4e3 * response(TIMES) + 7.0)
+    plain = delays(make_steps(), compute_response(TIMES))
+    other = delays(1e5 * make_steps() + 3e5, -4e3 * compute_response(TIMES) + 7.0)
     assert other.delay == pytest.approx(plain.delay, abs=1e-9)
     assert other.events == plain.events
 
@@ -109,11 +109,11 @@ def test_the_unit_of_neither_signal_matters() -> None:
 @pytest.mark.parametrize(
     ("u", "y", "reason"),
     [
-        (np.sin(TIMES), response(TIMES), "does not rest"),
-        (np.ones(TIMES.size), response(TIMES), "does not rest"),
-        (steps(), np.random.default_rng(0).normal(size=TIMES.size), "not clear"),
-        (steps(), 0.3 * TIMES + response(TIMES), "does not rest before any step"),
-        (steps(), np.zeros(TIMES.size), "not clear"),
+        (np.sin(TIMES), compute_response(TIMES), "does not rest"),
+        (np.ones(TIMES.size), compute_response(TIMES), "does not rest"),
+        (make_steps(), np.random.default_rng(0).normal(size=TIMES.size), "not clear"),
+        (make_steps(), 0.3 * TIMES + compute_response(TIMES), "does not rest before any step"),
+        (make_steps(), np.zeros(TIMES.size), "not clear"),
     ],
     ids=["sine", "constant", "noise", "drift", "nothing"],
 )
@@ -126,9 +126,9 @@ def test_what_has_no_clear_onset_says_why(u: FloatArray, y: FloatArray, reason: 
 
 def test_steps_at_which_another_input_moves_too_do_not_count() -> None:
     model = load_model("fopdt")
-    two = Channel("u", TIMES, steps(), hold="zero")
+    two = Channel("u", TIMES, make_steps(), hold="zero")
     moving = Channel("other", TIMES, np.sin(9 * TIMES))
-    record = Record((two, moving), (Channel("y", TIMES, response(TIMES)),))
+    record = Record((two, moving), (Channel("y", TIMES, compute_response(TIMES)),))
     # The model has one input only: what else was recorded is no cause.
     assert estimate_onset_delays(model, (record,))[0].delay is not None
     assert len(estimate_onset_delays(model, (record,))) == 1
@@ -151,24 +151,24 @@ def test_a_channel_s_noise_is_taken_as_often_for_many_events_as_for_one(
     calls: list[int] = []
     noise = onset_delay._estimate_noise
 
-    def counted(values: FloatArray) -> float:
+    def count_and_estimate(values: FloatArray) -> float:
         calls.append(values.size)
         return noise(values)
 
-    monkeypatch.setattr(onset_delay, "_estimate_noise", counted)
+    monkeypatch.setattr(onset_delay, "_estimate_noise", count_and_estimate)
     counts = []
-    for u in (np.where(steps() > 0, 1.0, 0.0), steps()):
+    for u in (np.where(make_steps() > 0, 1.0, 0.0), make_steps()):
         calls.clear()
         onset_delay._find_cached_rests.cache_clear()  # of what other tests have looked at
         other = Channel("v", TIMES, np.zeros(TIMES.size))
-        assert delays(u, response(TIMES), others=(other,)).events > 0
+        assert delays(u, compute_response(TIMES), others=(other,)).events > 0
         counts.append(len(calls))
     assert counts[0] == counts[1]
 
 
 def test_of_many_events_an_even_part_gives_the_same_delay(monkeypatch: pytest.MonkeyPatch) -> None:
     times = np.arange(200 * HOLD) * STEP
-    u = np.tile(steps(), 34)[: times.size]
+    u = np.tile(make_steps(), 34)[: times.size]
     lag = 13
     y = np.concatenate([np.zeros(lag), u[:-lag]])
     record = Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))

@@ -14,9 +14,9 @@ from sysid.models.parse import parse_model
 from sysid.residuals.sandwich import count_repeats, estimate_sandwich
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
-from tests.models import LINE
-from tests.profiles import draw_seeds
-from tests.rates import bound_count
+from tests.support.library.small_models import LINE
+from tests.support.profiles import draw_seeds
+from tests.support.random_bounds import bound_count
 
 MODEL = parse_model(LINE)
 TRUTH = np.array([2.0, 1.0])

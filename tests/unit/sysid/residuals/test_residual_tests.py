@@ -23,9 +23,9 @@ from sysid.residuals.residual_tests import (
     run_residual_tests,
 )
 from sysid.simulation.problem import Problem
-from tests.models import difference
-from tests.profiles import draw_seeds
-from tests.rates import bound_count, bound_mean
+from tests.support.library.small_models import difference
+from tests.support.profiles import draw_seeds
+from tests.support.random_bounds import bound_count, bound_mean
 
 N, STEP = 400, 0.1
 TIMES = np.arange(N) * STEP
@@ -36,18 +36,18 @@ def draws(seed: int) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def held(draw: np.random.Generator, n: int = N) -> FloatArray:
+def draw_held(draw: np.random.Generator, n: int = N) -> FloatArray:
     return np.repeat(draw.choice([-1.0, 1.0], n // 5), 5)
 
 
-def coloured(draw: np.random.Generator, pole: float, n: int = N) -> FloatArray:
+def draw_coloured(draw: np.random.Generator, pole: float, n: int = N) -> FloatArray:
     values = draw.normal(size=n + 200)
     for k in range(1, values.size):
         values[k] += pole * values[k - 1]
     return values[200:]
 
 
-def found(
+def correlate_residual(
     residual: FloatArray, u: FloatArray, *, times: FloatArray = TIMES, **more: Any
 ) -> list[CorrelationFunction]:
     n = residual.size
@@ -57,8 +57,8 @@ def found(
     return compute_correlations([one])
 
 
-def outcomes(residual: FloatArray, u: FloatArray, **more: Any) -> list[str]:
-    return [one.test.outcome for one in found(residual, u, **more)]
+def list_outcomes(residual: FloatArray, u: FloatArray, **more: Any) -> list[str]:
+    return [one.test.outcome for one in correlate_residual(residual, u, **more)]
 
 
 @pytest.mark.slow
@@ -66,8 +66,8 @@ def test_white_noise_passes_both_tests_together_in_about_95_of_100_draws() -> No
     passed, seeds = 0, draw_seeds(gate=200, night=2000)
     for seed in seeds:
         draw = draws(seed)
-        u = held(draw)
-        whole = judge_tests(found(draw.normal(size=N), u), "validation")
+        u = draw_held(draw)
+        whole = judge_tests(correlate_residual(draw.normal(size=N), u), "validation")
         passed += whole.passed is True
     least, most = bound_count(len(seeds), 0.94, 0.96)
     assert least <= passed <= most
@@ -78,7 +78,10 @@ def test_white_noise_has_95_and_99_of_100_lags_inside_the_bands() -> None:
     for seed in draw_seeds(gate=100, night=1000):
         draw = draws(seed)
         inside.append(
-            [(c.test.inside95, c.test.inside99) for c in found(draw.normal(size=N), held(draw))]
+            [
+                (c.test.inside95, c.test.inside99)
+                for c in correlate_residual(draw.normal(size=N), draw_held(draw))
+            ]
         )
     for of_test in np.array(inside, dtype=float).transpose(1, 2, 0):
         for shares, told in zip(of_test, (0.95, 0.99), strict=True):
@@ -88,15 +91,15 @@ def test_white_noise_has_95_and_99_of_100_lags_inside_the_bands() -> None:
 def test_noise_of_first_order_is_not_white() -> None:
     for seed in range(20):
         draw = draws(seed)
-        assert outcomes(coloured(draw, 0.5), held(draw))[0] == "failed"
+        assert list_outcomes(draw_coloured(draw, 0.5), draw_held(draw))[0] == "failed"
 
 
 def test_coloured_noise_that_is_independent_of_a_coloured_input_passes_that_test() -> None:
     passed, seeds = 0, draw_seeds(gate=150, night=1500)
     for seed in seeds:
         draw = draws(seed)
-        residual, u = coloured(draw, 0.9), coloured(draw, 0.9)
-        passed += outcomes(residual, u)[1] == "passed"
+        residual, u = draw_coloured(draw, 0.9), draw_coloured(draw, 0.9)
+        passed += list_outcomes(residual, u)[1] == "passed"
     # With bands of white noise it would be one in ten.
     assert passed >= bound_count(len(seeds), 0.94)[0]
 
@@ -104,16 +107,16 @@ def test_coloured_noise_that_is_independent_of_a_coloured_input_passes_that_test
 def test_a_response_that_the_model_missed_fails_the_test_against_its_input() -> None:
     for seed in range(20):
         draw = draws(seed)
-        u = held(draw)
+        u = draw_held(draw)
         missed = np.concatenate([np.zeros(7), u[:-7]])
-        assert outcomes(draw.normal(size=N) + 0.5 * missed, u)[1] == "failed"
+        assert list_outcomes(draw.normal(size=N) + 0.5 * missed, u)[1] == "failed"
 
 
 def test_the_cross_correlation_is_largest_at_the_lag_that_was_missed() -> None:
     draw = draws(5)
     u = draw.normal(size=N)
     residual = 0.2 * draw.normal(size=N) + np.concatenate([np.zeros(7), u[:-7]])
-    crossed = found(residual, u)[1]
+    crossed = correlate_residual(residual, u)[1]
     assert crossed.lags[np.argmax(np.abs(crossed.values))] == 7
     assert crossed.period == pytest.approx(STEP)
     assert crossed.lags[0] == -25
@@ -123,14 +126,14 @@ def test_the_cross_correlation_is_largest_at_the_lag_that_was_missed() -> None:
 def test_an_offset_of_the_model_is_a_fault_too() -> None:
     draw = draws(2)
     residual = draw.normal(size=N)
-    assert outcomes(residual, held(draw))[0] == "passed"
-    assert outcomes(residual + 1.0, held(draw))[0] == "failed"
+    assert list_outcomes(residual, draw_held(draw))[0] == "passed"
+    assert list_outcomes(residual + 1.0, draw_held(draw))[0] == "failed"
 
 
 def test_neither_test_depends_on_the_units_of_time_residual_and_input() -> None:
     draw = draws(3)
-    residual, u = draw.normal(size=N), held(draw)
-    first = found(residual, u)
+    residual, u = draw.normal(size=N), draw_held(draw)
+    first = correlate_residual(residual, u)
     one = make_residual_series(
         0,
         "y",
@@ -147,12 +150,14 @@ def test_neither_test_depends_on_the_units_of_time_residual_and_input() -> None:
 
 def test_missing_and_skipped_samples_take_no_part() -> None:
     draw = draws(4)
-    residual, u = draw.normal(size=N), held(draw)
+    residual, u = draw.normal(size=N), draw_held(draw)
     scored = draw.random(N) > 0.2
     scored[:30] = False
     spoilt = np.where(scored, residual, 1e6)
     for here, there in zip(
-        found(residual, u, scored=scored), found(spoilt, u, scored=scored), strict=True
+        correlate_residual(residual, u, scored=scored),
+        correlate_residual(spoilt, u, scored=scored),
+        strict=True,
     ):
         assert here.test == there.test
         np.testing.assert_array_equal(here.values, there.values)
@@ -164,12 +169,14 @@ def test_white_noise_with_gaps_or_at_irregular_times_passes_as_often() -> None:
     gaps, irregular, seeds = [], [], draw_seeds(gate=120, night=1200)
     for seed in seeds:
         draw = draws(seed)
-        residual, u = draw.normal(size=N), held(draw)
+        residual, u = draw.normal(size=N), draw_held(draw)
         gaps.append(
-            judge_tests(found(residual, u, scored=draw.random(N) > 0.3), "validation").passed
+            judge_tests(
+                correlate_residual(residual, u, scored=draw.random(N) > 0.3), "validation"
+            ).passed
         )
         times = np.sort(draw.uniform(0, TIMES[-1], N // 2))
-        curves = found(residual[: N // 2], u, times=times)
+        curves = correlate_residual(residual[: N // 2], u, times=times)
         assert curves[0].period is None
         irregular.append(judge_tests(curves, "validation").passed)
     least, _ = bound_count(len(seeds), 0.94)
@@ -179,10 +186,10 @@ def test_white_noise_with_gaps_or_at_irregular_times_passes_as_often() -> None:
 
 def test_a_missed_response_is_found_at_irregular_times_too() -> None:
     draw = draws(6)
-    u = held(draw)
+    u = draw_held(draw)
     times = np.sort(draw.uniform(3, TIMES[-1], N // 2))
     missed = u[np.floor((times - 0.7) / STEP).astype(int)]
-    assert outcomes(draw.normal(size=N // 2) + 0.7 * missed, u, times=times)[1] == "failed"
+    assert list_outcomes(draw.normal(size=N // 2) + 0.7 * missed, u, times=times)[1] == "failed"
 
 
 def test_residuals_that_are_rounding_are_not_tested() -> None:
@@ -195,7 +202,7 @@ def test_residuals_that_are_rounding_are_not_tested() -> None:
         measured,
         measured - rounding,
         np.ones(N, dtype=bool),
-        (Channel("u", TIMES, held(draws(1))),),
+        (Channel("u", TIMES, draw_held(draws(1))),),
     )
     curves = compute_correlations([one])
     assert {curve.test.outcome for curve in curves} == {"not tested"}
@@ -207,15 +214,15 @@ def test_residuals_that_are_rounding_are_not_tested() -> None:
     ("residual", "u", "outcome", "reason"),
     [
         (np.ones(10), np.ones(10), ["not tested", "not tested"], "10 samples are too few"),
-        (np.ones(N), held(draws(0)), ["failed", "not tested"], "the same everywhere"),
+        (np.ones(N), draw_held(draws(0)), ["failed", "not tested"], "the same everywhere"),
         (draws(0).normal(size=N), np.ones(N), ["passed", "not tested"], "the input is constant"),
-        (draws(0).normal(size=N), held(draws(0), 100)[:3], ["passed", "not tested"], "input"),
+        (draws(0).normal(size=N), draw_held(draws(0), 100)[:3], ["passed", "not tested"], "input"),
     ],
 )
 def test_what_cannot_be_tested_says_why(
     residual: FloatArray, u: FloatArray, outcome: list[str], reason: str
 ) -> None:
-    curves = found(residual, u, times=TIMES[: residual.size])
+    curves = correlate_residual(residual, u, times=TIMES[: residual.size])
     assert [one.test.outcome for one in curves] == outcome
     assert reason in curves[-1].test.reason
     assert curves[-1].values.size == 0
@@ -223,10 +230,10 @@ def test_what_cannot_be_tested_says_why(
 
 def test_with_a_robust_loss_outliers_do_not_decide() -> None:
     draw = draws(8)
-    residual, u = draw.normal(size=N), held(draw)
+    residual, u = draw.normal(size=N), draw_held(draw)
     residual[100:102] = 300.0  # two neighbours: with squares nothing but these would be seen
-    assert outcomes(residual, u)[0] == "failed"
-    assert outcomes(residual, u, loss_scale=1.0)[0] == "passed"
+    assert list_outcomes(residual, u)[0] == "failed"
+    assert list_outcomes(residual, u, loss_scale=1.0)[0] == "passed"
 
 
 def test_the_share_of_each_test_is_the_level_by_their_number() -> None:
@@ -245,9 +252,11 @@ def replace_experiment(one: Any, number: int) -> Any:
     return one._replace(experiment=number)
 
 
-def problem(draw: np.random.Generator, noise: float, **more: Any) -> tuple[Problem, FloatArray]:
+def build_problem(
+    draw: np.random.Generator, noise: float, **more: Any
+) -> tuple[Problem, FloatArray]:
     """First order plus dead time with its true parameters, and what it gives."""
-    u = held(draw)
+    u = draw_held(draw)
     record = Record((Channel("u", TIMES, u, hold="zero"),), (Channel("y", TIMES, np.zeros(N)),))
     true = {name: {"fixed": value} for name, value in TRUE.items()}
     bare = Problem.build(load_model("fopdt"), (record,), parameters=true, **more)
@@ -258,7 +267,7 @@ def problem(draw: np.random.Generator, noise: float, **more: Any) -> tuple[Probl
 
 
 def test_the_true_model_passes_and_one_with_another_lag_fails() -> None:
-    true, clean = problem(draws(11), 0.05)
+    true, clean = build_problem(draws(11), 0.05)
     whole = run_residual_tests(true, clean, "estimation")
     assert isinstance(whole, ResidualTests)
     assert whole.passed is True
@@ -271,7 +280,7 @@ def test_the_true_model_passes_and_one_with_another_lag_fails() -> None:
 
 
 def test_a_problem_hands_its_skipped_samples_and_its_loss_on() -> None:
-    true, clean = problem(draws(12), 0.05, skip=40, loss=Loss("soft-l1", 0.05))
+    true, clean = build_problem(draws(12), 0.05, skip=40, loss=Loss("soft-l1", 0.05))
     clean = clean.copy()
     clean[:40] = 1e3
     clean[200:202] += 30.0
@@ -281,11 +290,11 @@ def test_a_problem_hands_its_skipped_samples_and_its_loss_on() -> None:
 
 
 def test_a_true_model_without_noise_is_not_tested() -> None:
-    true, clean = problem(draws(13), 0.0)
+    true, clean = build_problem(draws(13), 0.0)
     assert run_residual_tests(true, clean, "estimation").passed is None
 
 
-def whiteness(residual: FloatArray, coefficients: int = 0) -> tuple[float, float]:
+def compute_whiteness(residual: FloatArray, coefficients: int = 0) -> tuple[float, float]:
     """Statistic and degrees of freedom."""
     n = residual.size
     one = make_residual_series(
@@ -301,7 +310,9 @@ def whiteness(residual: FloatArray, coefficients: int = 0) -> tuple[float, float
 @pytest.mark.parametrize("n", [24, 40, 100])
 def test_of_white_noise_the_statistic_has_the_mean_of_its_distribution(n: int) -> None:
     seeds = draw_seeds(gate=1000, night=10_000)
-    statistics, degrees = np.array([whiteness(draws(seed).normal(size=n)) for seed in seeds]).T
+    statistics, degrees = np.array(
+        [compute_whiteness(draws(seed).normal(size=n)) for seed in seeds]
+    ).T
     ratios = statistics / degrees
     # With n²/n_k it would be 0.92.
     assert np.mean(ratios) == pytest.approx(1.0, abs=bound_mean(ratios, 0.01))
@@ -310,16 +321,16 @@ def test_of_white_noise_the_statistic_has_the_mean_of_its_distribution(n: int) -
 def test_one_step_ahead_the_statistic_loses_a_degree_for_each_coefficient_on_the_output() -> None:
     drawn = []
     for seed in draw_seeds(gate=300, night=3000):
-        y = coloured(draws(seed), 0.6)
+        y = draw_coloured(draws(seed), 0.6)
         past = np.column_stack([np.concatenate([np.zeros(k), y[:-k]]) for k in (1, 2, 3, 4)])
-        drawn.append(whiteness(y - past @ np.linalg.lstsq(past, y, rcond=None)[0], 4))
+        drawn.append(compute_whiteness(y - past @ np.linalg.lstsq(past, y, rcond=None)[0], 4))
     statistics, degrees = np.array(drawn).T
     assert set(degrees) == {21.0}
     assert np.mean(statistics) == pytest.approx(21.0, abs=bound_mean(statistics, 0.5))
 
 
 def test_a_degree_of_freedom_is_always_left_and_records_share_the_loss() -> None:
-    assert whiteness(draws(1).normal(size=40), 30)[1] == 1.0
+    assert compute_whiteness(draws(1).normal(size=40), 30)[1] == 1.0
     one = make_residual_series(
         0, "y", TIMES, draws(1).normal(size=N), np.zeros(N), np.ones(N, dtype=bool), ()
     )
@@ -364,7 +375,8 @@ def test_a_parameter_inside_a_function_of_a_state_is_a_coefficient() -> None:
 def test_only_predictions_one_step_ahead_of_the_estimation_data_lose_degrees() -> None:
     draw = draws(14)
     record = Record(
-        (Channel("u", TIMES, held(draw), hold="zero"),), (Channel("y", TIMES, draw.normal(size=N)),)
+        (Channel("u", TIMES, draw_held(draw), hold="zero"),),
+        (Channel("y", TIMES, draw.normal(size=N)),),
     )
     for prediction, data, degrees in (
         ("simulation", "estimation", 25.0),
@@ -379,10 +391,10 @@ def test_only_predictions_one_step_ahead_of_the_estimation_data_lose_degrees() -
 @pytest.mark.parametrize("kind", [np.int64, np.float32, np.float64])
 def test_one_input_after_another_is_told_apart_whatever_its_numbers_are(kind: type) -> None:
     draw = draws(7)
-    residual, inputs = draw.normal(size=N), [held(draw), held(draw)]
-    first, second = (found(residual, u)[1].values for u in inputs)
+    residual, inputs = draw.normal(size=N), [draw_held(draw), draw_held(draw)]
+    first, second = (correlate_residual(residual, u)[1].values for u in inputs)
     assert not np.array_equal(first, second)
-    again = [found(residual, u.astype(kind))[1].values for u in inputs]
+    again = [correlate_residual(residual, u.astype(kind))[1].values for u in inputs]
     assert np.array_equal(again, [first, second])
 
 
@@ -390,7 +402,7 @@ def test_one_input_after_another_is_told_apart_whatever_its_numbers_are(kind: ty
 def test_of_a_long_record_the_last_20_000_samples_are_tested(faulty: str, outcome: str) -> None:
     n = 23_000
     draw = draws(15)
-    residual, u = draw.normal(size=n), held(draw, n)
+    residual, u = draw.normal(size=n), draw_held(draw, n)
     span = slice(0, 3000) if faulty == "first" else slice(n - 3000, n)
     residual[span] += np.concatenate([np.zeros(7), u[span][:-7]])  # a missed response
     times = STEP * np.arange(n)
@@ -410,7 +422,7 @@ def test_outputs_of_other_weights_meet_a_robust_loss_with_their_weights() -> Non
     )
     draw = draws(16)
     record = Record(
-        (Channel("u", TIMES, held(draw)),),
+        (Channel("u", TIMES, draw_held(draw)),),
         tuple(Channel(name, TIMES, draw.normal(size=N)) for name in ("y", "z")),
     )
     scale, weights = 0.7, {"y": 4.0, "z": 0.25}
@@ -437,7 +449,7 @@ def test_samples_count_as_regular_up_to_5_percent_of_a_period_off_their_place(
     times = TIMES.copy()
     times[[50, 171]] += share * STEP
     assert space_residuals(times, np.ones(N)).is_regular is is_regular
-    crossed = found(draws(17).normal(size=N), held(draws(17)), times=times)
+    crossed = correlate_residual(draws(17).normal(size=N), draw_held(draws(17)), times=times)
     assert (crossed[0].period is not None) is is_regular
 
 

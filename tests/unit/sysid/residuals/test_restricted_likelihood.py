@@ -16,7 +16,7 @@ from sysid.residuals.restricted_likelihood import (
     fit_noise_colour,
 )
 from sysid.residuals.series import ResidualPart, is_coloured
-from tests.profiles import draw_seeds
+from tests.support.profiles import draw_seeds
 
 PLACES = [(0.5, -1.0), (1.3, 0.4), (-0.6, -3.0)]
 
@@ -28,21 +28,21 @@ def slow(n: int, pole: float, seed: int, white: float = 0.0) -> FloatArray:
     return np.asarray(np.sqrt(1 - white) * found + np.sqrt(white) * other[200:])
 
 
-def regressors(n: int) -> FloatArray:
+def make_regressors(n: int) -> FloatArray:
     """A level, a slope and a wave."""
     x = np.linspace(-1, 1, n)
     return np.column_stack([np.ones(n), x, np.sin(3 * x)])
 
 
-def residuals(values: FloatArray, columns: FloatArray) -> FloatArray:
+def compute_residuals(values: FloatArray, columns: FloatArray) -> FloatArray:
     return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])
 
 
 def with_gaps(n: int = 60) -> tuple[SpacedResiduals, FloatArray, FloatArray]:
     """A series with samples missing, its sensitivities, and the times of the others."""
     kept = np.sort(np.random.default_rng(2).permutation(n)[: n - 12])
-    columns = regressors(n)[kept]
-    values = residuals(slow(n, 0.7, 1)[kept], columns)
+    columns = make_regressors(n)[kept]
+    values = compute_residuals(slow(n, 0.7, 1)[kept], columns)
     return space_residuals(kept.astype(np.float64), values), columns, kept.astype(np.float64)
 
 
@@ -62,7 +62,7 @@ def test_the_likelihood_is_that_of_combinations_without_the_parameters(
     series = _ObservedSeries(values, basis, np.diff(times).astype(np.int64))
     free = np.linalg.svd(columns)[0][:, 3:]  # orthogonal to all sensitivities
 
-    def expected(at: tuple[float, float]) -> float:
+    def compute_expected(at: tuple[float, float]) -> float:
         inner = free.T @ dense(at, times) @ free
         told = free.T @ values
         power = float(told @ np.linalg.solve(inner, told))
@@ -71,7 +71,7 @@ def test_the_likelihood_is_that_of_combinations_without_the_parameters(
     other = PLACES[1]
     assert _compute_deviance(np.array(place), series) - _compute_deviance(
         np.array(other), series
-    ) == pytest.approx(expected(place) - expected(other), abs=1e-8)
+    ) == pytest.approx(compute_expected(place) - compute_expected(other), abs=1e-8)
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -98,11 +98,11 @@ def test_the_middle_is_that_of_the_whole_matrix_over_gaps_too(place: tuple[float
 def test_variances_are_on_average_those_of_the_noise_though_residuals_are_less() -> None:
     """Of sixty samples with three parameters; from the residuals' own sums it would be half."""
     n, pole = 60, 0.7
-    columns, times = regressors(n), np.arange(60.0)
+    columns, times = make_regressors(n), np.arange(60.0)
     truth = np.diag(columns.T @ toeplitz(pole ** np.arange(n)) @ columns)
     found, plain, seeds = [], [], draw_seeds(gate=50, night=600)
     for seed in seeds:
-        left = residuals(slow(n, pole, seed), columns)
+        left = compute_residuals(slow(n, pole, seed), columns)
         known = fit_noise_colour(space_residuals(times, left), columns)
         if known is not None:
             found.append(np.diag(known.middle) / truth)
@@ -117,19 +117,22 @@ def test_variances_are_on_average_those_of_the_noise_though_residuals_are_less()
 def test_what_is_no_first_order_noise_is_not_taken_for_one() -> None:
     white = np.random.default_rng(0).standard_normal(400)
     ringing = lfilter([1.0], [1.0, -1.4, 0.85], white)[200:]
-    columns = regressors(200)
-    laid = space_residuals(np.arange(200.0), residuals(ringing, columns))
+    columns = make_regressors(200)
+    laid = space_residuals(np.arange(200.0), compute_residuals(ringing, columns))
     assert fit_noise_colour(laid, columns) is None
-    assert fit_noise_colour(space_residuals(np.arange(4.0), slow(4, 0.5, 0)), regressors(4)) is None
+    assert (
+        fit_noise_colour(space_residuals(np.arange(4.0), slow(4, 0.5, 0)), make_regressors(4))
+        is None
+    )
 
 
 def test_the_slower_the_noise_the_fewer_degrees_of_freedom() -> None:
-    columns, times = regressors(100), np.arange(100.0)
+    columns, times = make_regressors(100), np.arange(100.0)
     degrees = []
     for pole in (0.3, 0.8):
         each = [
             fit_noise_colour(
-                space_residuals(times, residuals(slow(100, pole, s), columns)), columns
+                space_residuals(times, compute_residuals(slow(100, pole, s), columns)), columns
             )
             for s in draw_seeds(gate=15, night=200)
         ]
@@ -141,11 +144,13 @@ def test_the_slower_the_noise_the_fewer_degrees_of_freedom() -> None:
 
 
 def test_short_slow_noise_is_recognised_by_its_neighbours_and_white_noise_no_more_often() -> None:
-    columns, times = regressors(100), np.arange(100.0)
+    columns, times = make_regressors(100), np.arange(100.0)
     part = ResidualPart(0, "y", slice(0, 100), times, 1.0)
     counts, seeds = [], draw_seeds(gate=200, night=2000)
     for pole in (0.5, 0.0):
-        every = [space_residuals(times, residuals(slow(100, pole, s), columns)) for s in seeds]
+        every = [
+            space_residuals(times, compute_residuals(slow(100, pole, s), columns)) for s in seeds
+        ]
         by_all = sum(chdtrc(one.n_lags, compute_whiteness(one).statistic) < 1e-3 for one in every)
         seen = sum(is_coloured(part, one.values) for one in every)
         counts.append((seen, by_all))

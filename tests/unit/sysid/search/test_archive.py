@@ -6,7 +6,7 @@ from sysid.core.settings import GeneticAlgorithm
 from sysid.identification.run import advance_run, begin_run
 from sysid.search.archive import SAME_POINT, archive_end, make_archive, read_archive
 from sysid.simulation.scaling import to_unit
-from tests.searching import example
+from tests.support.library.search_problems import example
 
 
 def test_ends_at_one_place_are_counted_and_the_lowest_is_kept() -> None:

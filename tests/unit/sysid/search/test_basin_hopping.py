@@ -11,7 +11,7 @@ from sysid.search.schedule import HOP_ALONG_COVARIANCE, HOP_IN_ONE_PARAMETER
 from sysid.search.slopes import build_normal_equations
 from sysid.simulation.evaluator import Evaluator
 from sysid.simulation.scaling import to_unit
-from tests.searching import COULOMB, example
+from tests.support.library.search_problems import COULOMB, example
 
 ALONE = GeneticAlgorithm(population=12, islands=1, stop=Stop(evaluations=6_000))
 PROBLEM = example("coulomb-eq16")
@@ -22,7 +22,7 @@ BEGIN = to_unit(PROBLEM.evaluator, np.array([[COULOMB[p.name] for p in PROBLEM.f
 DRAWN = 400
 
 
-def moved(
+def measure_hops(
     hop: int, is_evidence: bool = True, evaluator: Evaluator = PROBLEM.evaluator
 ) -> FloatArray:
     """How far hops of that kind lead (DRAWN, D), each by its own draw."""
@@ -43,15 +43,15 @@ def moved(
 def test_a_hop_of_one_parameter_moves_each_of_them_in_its_turn_and_no_other(
     is_evidence: bool,
 ) -> None:
-    moves = moved(HOP_IN_ONE_PARAMETER, is_evidence)
+    moves = measure_hops(HOP_IN_ONE_PARAMETER, is_evidence)
     assert np.all(np.sum(moves != 0.0, axis=1) == 1)
     assert np.all(np.abs(np.sum(moves != 0.0, axis=0) - DRAWN / 4) < 5 * np.sqrt(DRAWN * 3 / 16))
-    others = moved(HOP_ALONG_COVARIANCE, is_evidence)
+    others = measure_hops(HOP_ALONG_COVARIANCE, is_evidence)
     assert np.all(np.sum(others != 0.0, axis=1) == BEGIN.size)
 
 
 def test_it_leads_3_to_500_standard_errors_of_a_parameter_whose_fellows_are_held() -> None:
-    moves = moved(HOP_IN_ONE_PARAMETER)
+    moves = measure_hops(HOP_IN_ONE_PARAMETER)
     search = create_islands(PROBLEM, ALONE, 3)[0].search
     assert search["wide_differences"] == 0  # hops take the same derivatives
     matrix, _, base = build_normal_equations(PROBLEM.evaluator, PLAN, BEGIN, 1.0, 1e-6)
@@ -67,7 +67,7 @@ def test_it_leads_3_to_500_standard_errors_of_a_parameter_whose_fellows_are_held
 
 def test_a_parameter_that_changes_nothing_stays() -> None:
     blind = PROBLEM.evaluator._replace(weight=np.zeros_like(PROBLEM.evaluator.weight))
-    assert np.all(moved(HOP_IN_ONE_PARAMETER, evaluator=blind) == 0.0)
+    assert np.all(measure_hops(HOP_IN_ONE_PARAMETER, evaluator=blind) == 0.0)
 
 
 @pytest.mark.parametrize("is_evidence", [True, False])

@@ -7,7 +7,7 @@ from sysid.core.settings import GeneticAlgorithm
 from sysid.identification.run import advance_run, begin_run
 from sysid.islands.stopping import count_restarts
 from sysid.search.basin_hopping import find_odd_increment
-from tests.searching import example
+from tests.support.library.search_problems import example
 
 
 def test_nothing_is_unlike_its_neighbours_on_a_parabola() -> None:

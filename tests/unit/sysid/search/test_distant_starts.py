@@ -22,21 +22,21 @@ from sysid.search.slopes import evaluate_partial_fitness
 from sysid.search.state import IslandPlan
 from sysid.simulation.evaluator import predict_partially
 from sysid.simulation.problem import Problem
-from tests.searching import COULOMB, example, noisy, record
+from tests.support.library.search_problems import COULOMB, example, noisy, record
 
 ALONE = GeneticAlgorithm(population=12, islands=1, stop=Stop(evaluations=6_000))
 PROBLEM = example("coulomb-eq16")
 FALSE = COULOMB | {"b": 3.0}
 
 
-def plan() -> IslandPlan:
+def read_plan() -> IslandPlan:
     return make_plans(PROBLEM, ALONE, 3)[0]
 
 
 def island_at(values: dict[str, float]) -> Island:
     """A new island whose individuals all have these values."""
     place = [(values[p.name] - p.lower) / (p.upper - p.lower) for p in PROBLEM.free_parameters]
-    words = np.asarray(encode(np.array([place] * 12), plan().bits))
+    words = np.asarray(encode(np.array([place] * 12), read_plan().bits))
     return replace(
         create_islands(PROBLEM, ALONE, 3)[0], chromosomes=words, fitness=np.full(12, 1.0)
     )
@@ -48,7 +48,7 @@ def test_errors_are_coloured_where_the_response_is_wrong(
 ) -> None:
     island = island_at(values)
     before = island.evaluations
-    assert is_champion_coloured(PROBLEM.evaluator, plan(), island.arrays) == wanted
+    assert is_champion_coloured(PROBLEM.evaluator, read_plan(), island.arrays) == wanted
     assert island.evaluations == before + 1
 
 
@@ -58,10 +58,10 @@ def test_only_noise_is_left_where_the_response_is_right(
 ) -> None:
     island = island_at(values)
     before = island.evaluations
-    assert is_champion_explained(PROBLEM.evaluator, plan(), island.arrays) == wanted
+    assert is_champion_explained(PROBLEM.evaluator, read_plan(), island.arrays) == wanted
     assert island.evaluations == before + 1
-    island.search["evaluations"] = plan().most_evaluations
-    assert not is_champion_explained(PROBLEM.evaluator, plan(), island.arrays)
+    island.search["evaluations"] = read_plan().most_evaluations
+    assert not is_champion_explained(PROBLEM.evaluator, read_plan(), island.arrays)
 
 
 @pytest.mark.parametrize("coloured", [False, True])
@@ -78,14 +78,17 @@ def test_a_hop_that_returns_finds_out_whether_only_noise_is_left(coloured: bool)
 def test_a_part_is_lost_where_the_champion_fits_it_better() -> None:
     theta = np.array([[FALSE[p.name] for p in PROBLEM.free_parameters]])
     predicted = predict_partially(PROBLEM.evaluator, theta, 0.25)
-    loss = evaluate_partial_fitness(PROBLEM.evaluator, plan(), predicted, 0.25)[0]
+    loss = evaluate_partial_fitness(PROBLEM.evaluator, read_plan(), predicted, 0.25)[0]
     island = island_at(FALSE)
     for share, wanted in ((1.001, True), (0.999, False)):
         reached = share * loss
-        assert is_behind_champion(PROBLEM.evaluator, plan(), island.arrays, 0.25, reached) == wanted
-    island.search["evaluations"] = plan().most_evaluations
-    assert not is_behind_champion(PROBLEM.evaluator, plan(), island.arrays, 0.25, 2.0 * loss)
-    assert island.evaluations == plan().most_evaluations
+        assert (
+            is_behind_champion(PROBLEM.evaluator, read_plan(), island.arrays, 0.25, reached)
+            == wanted
+        )
+    island.search["evaluations"] = read_plan().most_evaluations
+    assert not is_behind_champion(PROBLEM.evaluator, read_plan(), island.arrays, 0.25, 2.0 * loss)
+    assert island.evaluations == read_plan().most_evaluations
 
 
 @pytest.mark.parametrize(("values", "kinds"), [(COULOMB, "hhhh"), (FALSE, "hfff")])
@@ -98,7 +101,7 @@ def test_a_champion_whose_errors_are_no_noise_lets_fresh_starts_have_the_turns_o
         search = island.search
         search["fitness_discontinuities"] = search["champion_converged"] = 1
         search["local_searches"] = turn - 1
-        start_local_search(PROBLEM.evaluator, plan(), island.arrays)
+        start_local_search(PROBLEM.evaluator, read_plan(), island.arrays)
         seen += "f" if search["from_random_start"] else "h" if search["hop"] else "?"
         assert (search["horizon"] <= 0.25) == bool(search["from_random_start"])
     assert seen == kinds

@@ -23,7 +23,7 @@ from sysid.search.operators import decode
 from sysid.search.sequence_search import run_fixed_sequence
 from sysid.search.state import COLUMN_VALUES, IslandPlan
 from sysid.simulation.scaling import from_unit
-from tests.searching import example, with_search
+from tests.support.library.search_problems import example, with_search
 
 PROBLEM = example(n=80)
 

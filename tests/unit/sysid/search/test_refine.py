@@ -12,7 +12,7 @@ from sysid.search import least_squares, refine
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import to_unit
-from tests.searching import example, force, noisy, record
+from tests.support.library.search_problems import example, force, noisy, record
 
 NEAR = np.array([0.22, 0.52, 5.1, 1.1])
 
@@ -106,13 +106,13 @@ def test_on_long_records_a_compiled_call_makes_few_steps_and_the_bits_are_the_sa
 ) -> None:
     calls: list[int] = []
 
-    def noted(
+    def note_and_solve(
         *arguments: object, at_once: int, **settings: object
     ) -> least_squares.LeastSquaresSolution:
         calls.append(at_once)
         return least_squares.solve_least_squares(*arguments, at_once=at_once, **settings)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(refine, "solve_least_squares", noted)
+    monkeypatch.setattr(refine, "solve_least_squares", note_and_solve)
     problem = example()
     whole = refine_candidates(problem, [NEAR])[0]
     monkeypatch.setattr(

@@ -10,7 +10,7 @@ from sysid.islands.archipelago import create_islands, make_plans
 from sysid.search.island import Island, evolve
 from sysid.search.schedule import GROW_NEARBY, HOP, NO_HOP, SINGLE_HOP
 from sysid.search.state import SAME_OPTIMUM, SearchArray
-from tests.searching import bits, example
+from tests.support.library.search_problems import bits, example
 
 ALONE = GeneticAlgorithm(population=12, islands=1, stop=Stop(evaluations=6_000))
 GENERATIONS = 400
@@ -19,7 +19,7 @@ HOPS = [(kind.hop, kind.is_evidence) for kind in (HOP, SINGLE_HOP, GROW_NEARBY)]
 
 
 @cache
-def generations(model: str) -> tuple[Island, ...]:
+def list_generations(model: str) -> tuple[Island, ...]:
     """An island after every one of its generations, each evolved by itself."""
     problem = example(model)
     (plan,) = make_plans(problem, ALONE, 3)
@@ -33,7 +33,7 @@ def begun(model: str) -> list[SearchArray]:
     """Each development as it was begun after jumps had been met, or any."""
     return [
         after.search
-        for before, after in pairwise(generations(model))
+        for before, after in pairwise(list_generations(model))
         if after.search["local_searches"] > before.search["local_searches"] > 4
         and (before.search["fitness_discontinuities"] > 0 or model == "duffing-eq16")
     ]
@@ -48,8 +48,8 @@ def test_jumps_once_met_stay_known_when_a_better_champion_comes() -> None:
     assert later.champion_rms < 0.9 * evolve(problem.evaluator, plan, start, 1).champion_rms
     known = later.search
     assert (known["fitness_discontinuities"], known["champion_discontinuities"]) == (1, 0)
-    assert generations("coulomb-eq16")[-1].search["fitness_discontinuities"] > 0
-    assert generations("duffing-eq16")[-1].search["fitness_discontinuities"] == 0
+    assert list_generations("coulomb-eq16")[-1].search["fitness_discontinuities"] > 0
+    assert list_generations("duffing-eq16")[-1].search["fitness_discontinuities"] == 0
 
 
 def test_there_most_developments_are_hops_and_some_still_begin_anywhere() -> None:
@@ -70,7 +70,7 @@ def get_hop(search: SearchArray) -> tuple[int, bool]:
 
 def test_growing_from_beside_the_champion_is_no_evidence_for_it() -> None:
     """It need not lead back where a better one lies near, so it tells nothing of the champion."""
-    states = generations("coulomb-eq16")
+    states = list_generations("coulomb-eq16")
     ends = dict.fromkeys(HOPS, 0)
     for before, after in pairwise(states):
         hop = get_hop(before.search)
@@ -87,7 +87,7 @@ def test_it_can_be_cut_anywhere_there_too() -> None:
     (plan,) = make_plans(problem, ALONE, 3)
     at_once = evolve(problem.evaluator, plan, create_islands(problem, ALONE, 3)[0], GENERATIONS)
     assert at_once.search["fitness_discontinuities"] > 0
-    assert bits(at_once) == bits(generations("coulomb-eq16")[-1])
+    assert bits(at_once) == bits(list_generations("coulomb-eq16")[-1])
 
 
 @pytest.mark.parametrize("model", ["duffing-eq16", "coulomb-eq16"])
@@ -95,7 +95,7 @@ def test_a_local_search_that_leads_to_the_champion_confirms_it_and_another_does_
     model: str,
 ) -> None:
     ended = []
-    for before, after in pairwise(generations(model)):
+    for before, after in pairwise(list_generations(model)):
         old, new = before.search, after.search
         ends = new["in_sequence_search"] == 0 and (
             old["in_sequence_search"] == 1 or new["local_searches"] > old["local_searches"]

@@ -19,8 +19,15 @@ from sysid.selection.lag_search import search_lags
 from sysid.selection.regression import Regression
 from sysid.selection.select import select_model_terms
 from sysid.simulation.problem import Problem
-from tests.polynomials import LAGGED, TRUTH, document, frols, lagged, record_of
-from tests.results import conclude
+from tests.support.library.polynomials import (
+    LAGGED,
+    TRUTH,
+    build_lagged,
+    document,
+    frols,
+    record_of,
+)
+from tests.support.storage.run_results import conclude
 
 
 def chosen(terms: object, *records: Record, **changes: object) -> dict[str, float]:
@@ -29,7 +36,7 @@ def chosen(terms: object, *records: Record, **changes: object) -> dict[str, floa
     return {one.term: one.coefficient for one in model.selection.terms}
 
 
-def triangle(columns: FloatArray, target: FloatArray) -> FloatArray:
+def make_triangle(columns: FloatArray, target: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.qr(np.column_stack([columns, target]), mode="r"))
 
 
@@ -48,7 +55,7 @@ def random_regression(seed: int, terms: int = 7) -> tuple[FloatArray, FloatArray
 @pytest.mark.parametrize("seed", range(5))
 def test_each_step_takes_the_term_that_leaves_least(seed: int) -> None:
     columns, target = random_regression(seed)
-    found = select_forward(triangle(columns, target), 5)
+    found = select_forward(make_triangle(columns, target), 5)
     whole = float(target @ target)
     for step, term in enumerate(found.order):
         before = list(found.order[:step])
@@ -61,7 +68,7 @@ def test_each_step_takes_the_term_that_leaves_least(seed: int) -> None:
 
 def test_error_reduction_ratios_and_what_is_left_make_one() -> None:
     columns, target = random_regression(1)
-    found = select_forward(triangle(columns, target), 6)
+    found = select_forward(make_triangle(columns, target), 6)
     assert sum(found.ratios) + found.unexplained_shares[-1] == pytest.approx(1.0)
     assert all(ratio >= 0 for ratio in found.ratios)
 
@@ -69,7 +76,7 @@ def test_error_reduction_ratios_and_what_is_left_make_one() -> None:
 def test_the_scale_of_a_term_does_not_matter() -> None:
     columns, target = random_regression(2)
     scaled = columns * 10.0 ** np.arange(-6, 8, 2)
-    one, other = (select_forward(triangle(c, target), 5) for c in (columns, scaled))
+    one, other = (select_forward(make_triangle(c, target), 5) for c in (columns, scaled))
     assert one.order == other.order
     assert one.ratios == pytest.approx(other.ratios)
 
@@ -77,8 +84,8 @@ def test_the_scale_of_a_term_does_not_matter() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_an_exchange_never_explains_less_and_no_single_one_would_explain_more(seed: int) -> None:
     columns, target = random_regression(seed, terms=9)
-    found = select_forward(triangle(columns, target), 4)
-    better = exchange_terms(triangle(columns, target), found.order)
+    found = select_forward(make_triangle(columns, target), 4)
+    better = exchange_terms(make_triangle(columns, target), found.order)
     least = left_over(columns[:, list(better)], target)
     assert least <= left_over(columns[:, list(found.order)], target) * (1 + 1e-12)
     for place, term in product(range(4), set(range(9)) - set(better)):
@@ -92,7 +99,7 @@ def test_what_a_forward_choice_hides_an_exchange_finds() -> None:
     target = true[:, 0] + true[:, 1]
     decoy = target + 0.3 * rng.standard_normal(200)  # nearer to the output than either true term
     noise = 0.3 * rng.standard_normal((200, 3))
-    given = triangle(np.column_stack([true, decoy, noise]), target)
+    given = make_triangle(np.column_stack([true, decoy, noise]), target)
     assert select_forward(given, 2).order[0] == 2
     assert sorted(exchange_terms(given, select_forward(given, 2).order)) == [0, 1]
 
@@ -100,14 +107,14 @@ def test_what_a_forward_choice_hides_an_exchange_finds() -> None:
 def test_terms_that_depend_on_each_other_are_taken_once() -> None:
     columns, target = random_regression(3, terms=3)
     doubled = np.column_stack([columns, columns @ [1.0, 2.0, 3.0], columns[:, 0]])
-    found = select_forward(triangle(doubled, target), 5)
+    found = select_forward(make_triangle(doubled, target), 5)
     assert len(found.order) == 3
 
 
 def test_coefficients_solve_the_least_squares_problem() -> None:
     columns, target = random_regression(4)
     expected = np.linalg.lstsq(columns[:, [5, 1]], target, rcond=None)[0]
-    found = solve_coefficients(triangle(columns, target), [5, 1])
+    found = solve_coefficients(make_triangle(columns, target), [5, 1])
     assert found[[5, 1]] == pytest.approx(expected)
     assert np.count_nonzero(found) == 2
 
@@ -204,7 +211,7 @@ def test_a_selection_without_the_missing_samples_is_still_right() -> None:
 def test_the_regression_reads_past_values_as_the_kernels_do(hold: str) -> None:
     lags = {"dh": 2.0, "dk": 3.4}
     record = record_of(LAGGED, lags=lags, hold=hold)  # type: ignore[arg-type]
-    model = parse_model(lagged(list(LAGGED)))
+    model = parse_model(build_lagged(list(LAGGED)))
     problem = Problem.build(model, [record])
     regression = Regression.from_experiments(model, [record], problem.experiments, model.parameters)
     folded, _ = regression.factor_terms(model.terms, lags)
@@ -215,7 +222,7 @@ def test_the_regression_reads_past_values_as_the_kernels_do(hold: str) -> None:
 def test_unknown_lags_are_chosen_with_the_terms_and_stay_unknown() -> None:
     lags = {"dh": 2.0, "dk": 5.0}
     record = record_of(LAGGED, lags=lags)
-    model, _ = select_model_terms(parse_model(lagged(frols(5))), [record])
+    model, _ = select_model_terms(parse_model(build_lagged(frols(5))), [record])
     assert model.selection is not None
     assert {one.term for one in model.selection.terms} == set(LAGGED)
     assert model.selection.lags == pytest.approx(lags)
@@ -225,7 +232,7 @@ def test_unknown_lags_are_chosen_with_the_terms_and_stay_unknown() -> None:
 def test_lags_are_tried_inside_the_bounds_of_the_request() -> None:
     record = record_of(LAGGED, lags={"dh": 2.0, "dk": 5.0})
     changes = {"dh": {"fixed": 2}, "dk": {"lower": 0, "upper": 3}}
-    model, kept = select_model_terms(parse_model(lagged(frols(5))), [record], changes)
+    model, kept = select_model_terms(parse_model(build_lagged(frols(5))), [record], changes)
     assert model.selection is not None
     assert model.selection.lags["dh"] == 2.0
     assert model.selection.lags["dk"] <= 3.0
@@ -284,7 +291,7 @@ def test_sets_of_terms_are_ranked_by_the_rule() -> None:
 
 
 def test_the_resolved_model_can_be_built_again_from_its_document_and_from_a_result() -> None:
-    asked = parse_model(lagged(frols(5)))
+    asked = parse_model(build_lagged(frols(5)))
     model, _ = select_model_terms(asked, [record_of(LAGGED, lags={"dh": 2.0, "dk": 5.0})])
     assert parse_model(model.document) == model
     assert model.rule is None

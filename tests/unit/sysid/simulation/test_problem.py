@@ -15,7 +15,14 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.simulation.evaluator import Evaluator, evaluate_population
 from sysid.simulation.problem import Problem, build_simulation_problem
-from tests.models import difference, differential, duffing, individuals, lag_element, record
+from tests.support.library.small_models import (
+    difference,
+    differential,
+    duffing,
+    individuals,
+    lag_element,
+    record,
+)
 
 
 @jit_compile

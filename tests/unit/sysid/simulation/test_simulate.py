@@ -9,7 +9,7 @@ import pytest
 from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.data.records import Channel
 from sysid.simulation.simulate import simulate
-from tests.models import differential, lag_element, record
+from tests.support.library.small_models import differential, lag_element, record
 
 TIMES = 0.05 * np.arange(60)
 STEP = Channel("u", TIMES, np.where(TIMES >= 0.5, 1.0, 0.0), hold="zero")

@@ -14,15 +14,15 @@ from sysid.simulation.scaling import from_unit, to_unit
 from sysid.simulation.simulate import simulate
 from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.estimates import Estimate
-from tests.profiles import draw_seeds
-from tests.rates import bound_count, bound_mean
-from tests.searching import COULOMB, DUFFING, example, force, noisy, record
+from tests.support.library.search_problems import COULOMB, DUFFING, example, force, noisy, record
+from tests.support.profiles import draw_seeds
+from tests.support.random_bounds import bound_count, bound_mean
 
 # Cramér-Rao bound of Example 1, measurement noise of sd 0.01, 300 samples (from theory).
 BOUND = {"c": 0.0049, "L": 0.0025, "b": 0.0198, "a": 0.0268}
 
 
-def truth(problem: Problem) -> FloatArray:
+def read_truth(problem: Problem) -> FloatArray:
     return np.array([DUFFING[p.name] for p in problem.free_parameters])
 
 
@@ -32,7 +32,7 @@ def by_name(estimates: tuple[Estimate, ...]) -> dict[str, Estimate]:
 
 def test_standard_errors_of_example_1_are_the_cramer_rao_bound() -> None:
     problem = example()
-    start = refine_candidates(problem, [truth(problem)])[0]
+    start = refine_candidates(problem, [read_truth(problem)])[0]
     assert start is not None
     for estimate in analyse_estimate(problem, start.theta).estimates:
         assert estimate.stderr == pytest.approx(BOUND[estimate.name], rel=0.15)
@@ -43,7 +43,7 @@ def test_estimates_scatter_as_their_standard_errors_say() -> None:
     squares = []
     for seed in draw_seeds(gate=40, night=400):
         problem = Problem.build(load_model("duffing-eq16"), [record(noisy(seed=seed))])
-        end = refine_candidates(problem, [truth(problem)])[0]
+        end = refine_candidates(problem, [read_truth(problem)])[0]
         assert end is not None
         estimates = analyse_estimate(problem, end.theta).estimates
         errors = [(one.value - DUFFING[one.name]) / (one.stderr or np.nan) for one in estimates]
@@ -56,7 +56,7 @@ def test_records_of_unequal_noise_each_count_with_their_own() -> None:
     # freedom the estimates leave it.
     exact, vague = record(noisy(seed=1)), record(noisy(n=80, sd=0.06, seed=2))
     problem = Problem.build(load_model("duffing-eq16"), [exact, vague])
-    end = refine_candidates(problem, [truth(problem)])[0]
+    end = refine_candidates(problem, [read_truth(problem)])[0]
     assert end is not None
     found = analyse_estimate(problem, end.theta)
     assert found.uncertainty is not None
@@ -159,7 +159,7 @@ def test_standard_errors_beside_the_jumps_of_coulomb_friction_are_those_of_repet
 
 def test_intervals_are_of_the_t_distribution() -> None:
     problem = Problem.build(load_model("duffing-eq16"), [record(noisy())], skip=288)
-    analysis = analyse_estimate(problem, truth(problem))
+    analysis = analyse_estimate(problem, read_truth(problem))
     estimate = analysis.estimates[0]
     assert estimate.stderr is not None
     assert estimate.interval95 is not None
@@ -169,13 +169,13 @@ def test_intervals_are_of_the_t_distribution() -> None:
 
 def test_without_noise_the_standard_errors_vanish() -> None:
     problem = example(sd=0.0)
-    analysis = analyse_estimate(problem, truth(problem))
+    analysis = analyse_estimate(problem, read_truth(problem))
     assert all(e.stderr is not None and e.stderr < 1e-9 for e in analysis.estimates)
     assert all(e.status == "identified" for e in analysis.estimates)
 
 
 def test_the_correlation_matrix_is_one_of_correlations() -> None:
-    uncertainty = analyse_estimate(example(), truth(example())).uncertainty
+    uncertainty = analyse_estimate(example(), read_truth(example())).uncertainty
     assert uncertainty is not None
     assert np.allclose(uncertainty.correlation, uncertainty.correlation.T)
     assert np.allclose(np.diag(uncertainty.correlation), 1.0)
@@ -184,7 +184,7 @@ def test_the_correlation_matrix_is_one_of_correlations() -> None:
     assert uncertainty.condition > 1
 
 
-def document(equation: str) -> dict[str, object]:
+def build_document(equation: str) -> dict[str, object]:
     return {
         "name": "test",
         "form": "difference",
@@ -201,8 +201,8 @@ def document(equation: str) -> dict[str, object]:
     }
 
 
-def analysed(equation: str, theta: list[float]) -> dict[str, Estimate]:
-    model = load_model(document(equation))
+def analyse_equation(equation: str, theta: list[float]) -> dict[str, Estimate]:
+    model = load_model(build_document(equation))
     input_ = force(50)
     y = 0.9 * np.concatenate([[0.0], input_.values[:-1]])
     y = y + 0.1 * np.random.default_rng(0).standard_normal(50)
@@ -212,7 +212,7 @@ def analysed(equation: str, theta: list[float]) -> dict[str, Estimate]:
 
 
 def test_a_parameter_without_effect_is_unidentifiable_and_says_so() -> None:
-    found = analysed("g*q(k-1) + h2*0.1*sin(k) + 0*u", [0.9, 0.3, 5.0])
+    found = analyse_equation("g*q(k-1) + h2*0.1*sin(k) + 0*u", [0.9, 0.3, 5.0])
     assert found["u"].status == "unidentifiable"
     assert found["u"].stderr is None
     assert "does not change" in found["u"].reason
@@ -220,14 +220,14 @@ def test_a_parameter_without_effect_is_unidentifiable_and_says_so() -> None:
 
 
 def test_factors_of_one_product_are_a_group() -> None:
-    found = analysed("g*h2*q(k-1) + u*sin(k)", [0.3, 3.0, 0.5])
+    found = analyse_equation("g*h2*q(k-1) + u*sin(k)", [0.3, 3.0, 0.5])
     assert [found[name].status for name in ("g", "h2", "u")] == ["group", "group", "identified"]
     assert found["g"].stderr is None
     assert "combination" in found["g"].reason
 
 
 def test_an_estimate_at_its_bound_has_a_standard_error() -> None:
-    found = analysed("g*q(k-1) + h2*sin(k) + u*cos(2*k)", [0.9, 0.0, 0.1])
+    found = analyse_equation("g*q(k-1) + h2*sin(k) + u*cos(2*k)", [0.9, 0.0, 0.1])
     assert found["h2"].status == "at bound"
     assert found["h2"].stderr is not None
     assert found["h2"].reason
@@ -236,7 +236,7 @@ def test_an_estimate_at_its_bound_has_a_standard_error() -> None:
 def test_as_many_samples_as_parameters_give_no_standard_error() -> None:
     model = load_model("duffing-eq16")
     problem = Problem.build(model, [record(noisy())], skip=296)
-    analysis = analyse_estimate(problem, truth(problem))
+    analysis = analyse_estimate(problem, read_truth(problem))
     assert analysis.uncertainty is None
     assert all(e.stderr is None and "4 samples" in e.reason for e in analysis.estimates)
 
@@ -258,7 +258,7 @@ def test_outliers_widen_robust_standard_errors_little() -> None:
 
     def errors(values: FloatArray, loss: Loss) -> FloatArray:
         problem = Problem.build(load_model("duffing-eq16"), [record(values)], loss=loss)
-        end = refine_candidates(problem, [truth(problem)])[0]
+        end = refine_candidates(problem, [read_truth(problem)])[0]
         assert end is not None
         return np.array(
             [e.stderr for e in analyse_estimate(problem, end.theta).estimates], dtype=float
@@ -269,7 +269,7 @@ def test_outliers_widen_robust_standard_errors_little() -> None:
     assert np.all(errors(outliers, Loss()) > 5 * plain)
 
 
-def rounded(n: int = 300) -> Problem:
+def build_rounded(n: int = 300) -> Problem:
     """Example 1 where the model's lag is rounded to whole samples of 20 ms."""
     model = load_model("duffing-eq16").document
     solver = {"history": "constant", "interpolation": "nearest"}
@@ -277,7 +277,7 @@ def rounded(n: int = 300) -> Problem:
 
 
 def test_a_rounded_lag_is_no_surer_than_its_plateau() -> None:
-    problem = rounded()
+    problem = build_rounded()
     errors = []
     for lag in (0.4912, 0.4951, 0.5, 0.5049, 0.5088, 0.5099, 0.50999):  # all the same samples
         analysis = analyse_estimate(problem, np.array([0.2, lag, 5.0, 1.0]))
@@ -291,7 +291,7 @@ def test_a_rounded_lag_is_no_surer_than_its_plateau() -> None:
 
 def test_a_plateau_is_seen_although_the_place_of_another_parameter_is_rounded() -> None:
     """Estimates lie anywhere, and few of them stay the same as a place and back."""
-    problem = rounded()
+    problem = build_rounded()
     thetas = np.array([[0.2, 0.5, b, 1.0] for b in np.linspace(4.99, 5.01, 50)])
     back = from_unit(problem.evaluator, to_unit(problem.evaluator, thetas))
     theta = thetas[np.argmax(back[:, 2] != thetas[:, 2])]
@@ -302,7 +302,7 @@ def test_a_plateau_is_seen_although_the_place_of_another_parameter_is_rounded() 
 
 
 def test_the_interval_of_a_rounded_lag_does_not_depend_on_where_the_search_ended() -> None:
-    problem = rounded()
+    problem = build_rounded()
     for lag in (0.4901, 0.4912, 0.5, 0.5088, 0.5099):  # all the same samples
         found = by_name(analyse_estimate(problem, np.array([0.2, lag, 5.0, 1.0])).estimates)["L"]
         assert found.value == pytest.approx(lag)
@@ -314,7 +314,7 @@ def test_the_interval_of_a_rounded_lag_does_not_depend_on_where_the_search_ended
 
 
 def test_a_rounded_lag_leaves_the_other_standard_errors_alone() -> None:
-    found = by_name(analyse_estimate(rounded(), np.array([0.2, 0.5, 5.0, 1.0])).estimates)
+    found = by_name(analyse_estimate(build_rounded(), np.array([0.2, 0.5, 5.0, 1.0])).estimates)
     for name in ("c", "b", "a"):
         assert found[name].stderr == pytest.approx(BOUND[name], rel=0.25)
 
@@ -341,11 +341,11 @@ def test_of_a_budget_that_does_not_suffice_is_told_what_was_simulated(
     theta, simulated = np.array([0.2, 0.5, 5.0, 1.0]), []
     problem, inner = example(), Problem.predict
 
-    def counted(self: Problem, places: FloatArray) -> FloatArray:
+    def count_and_simulate(self: Problem, places: FloatArray) -> FloatArray:
         simulated.append(len(places))
         return inner(self, places)
 
-    monkeypatch.setattr(Problem, "predict", counted)
+    monkeypatch.setattr(Problem, "predict", count_and_simulate)
     short = analyse_estimate(problem, theta, most)
     assert short.uncertainty is None
     assert short.evaluations <= most

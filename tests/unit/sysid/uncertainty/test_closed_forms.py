@@ -16,8 +16,8 @@ from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.intervals import LocalStatistics, make_estimates
 from sysid.uncertainty.profile_likelihood import compute_profile
-from tests.models import LINE
-from tests.searching import example
+from tests.support.library.search_problems import example
+from tests.support.library.small_models import LINE
 
 N = 14
 TIMES = 0.1 * np.arange(N)
@@ -25,13 +25,13 @@ INPUT = np.sin(1.3 * np.arange(N)) + 0.1 * np.arange(N)
 COLUMNS = np.column_stack([INPUT, np.ones(N)])
 
 
-def measured(seed: int = 1, sd: float = 0.3) -> FloatArray:
+def draw_output(seed: int = 1, sd: float = 0.3) -> FloatArray:
     noise = np.random.default_rng(seed).normal(0.0, sd, N)
     return np.asarray(2.0 * INPUT + 1.0 + noise)
 
 
 def pose(y: FloatArray | None = None, **options: Any) -> Problem:
-    values = measured() if y is None else y
+    values = draw_output() if y is None else y
     record = Record((Channel("u", TIMES, INPUT),), (Channel("y", TIMES, values),))
     return Problem.build(parse_model(LINE), [record], **options)
 
@@ -84,7 +84,7 @@ def test_two_outputs_have_the_covariance_of_weighted_least_squares() -> None:
 
 
 def test_a_robust_line_has_the_covariance_of_an_m_estimator() -> None:
-    y = measured()
+    y = draw_output()
     y[4] += 3.0
     s = 0.2
     problem = pose(y, loss=Loss("soft-l1", s))
@@ -169,7 +169,7 @@ def test_a_tied_parameter_has_the_widest_quantile_of_what_it_is_tied_to(
 ) -> None:
     parameters = {**LINE["parameters"], "c": {"lower": -20, "upper": 20}}
     model = parse_model({**LINE, "parameters": parameters, "outputs": {"y": "a*u(t) + b + x + c"}})
-    record = Record((Channel("u", TIMES, INPUT),), (Channel("y", TIMES, measured()),))
+    record = Record((Channel("u", TIMES, INPUT),), (Channel("y", TIMES, draw_output()),))
     problem = Problem.build(model, [record], parameters={"c": {"tied": tie}})
     covariance = np.array([[0.04, -0.03], [-0.03, 0.09]])
     statistics = LocalStatistics(

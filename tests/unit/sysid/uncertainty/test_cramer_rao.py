@@ -9,14 +9,14 @@ from sysid.data.records import Channel, Record
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.cramer_rao import cramer_rao_bound
-from tests.models import LINE
-from tests.profiles import draw_seeds
+from tests.support.library.small_models import LINE
+from tests.support.profiles import draw_seeds
 
 TIMES = np.arange(200) * 0.1
 INPUT = np.sin(1.3 * TIMES) + 0.2 * TIMES
 
 
-def problem(document=LINE, skip=0, **options):
+def build_problem(document=LINE, skip=0, **options):
     model = parse_model(document)
     signals = Channel("u", TIMES, INPUT), Channel("y", TIMES, 2.0 * INPUT + 1.0)
     record = Record(inputs=signals[:1], outputs=signals[1:])
@@ -25,7 +25,7 @@ def problem(document=LINE, skip=0, **options):
 
 @pytest.mark.parametrize("skip", [0, 50])
 def test_the_bound_of_a_linear_model_is_that_of_its_regressors(skip):
-    found = cramer_rao_bound(problem(skip=skip), np.array([2.0, 1.0]))
+    found = cramer_rao_bound(build_problem(skip=skip), np.array([2.0, 1.0]))
     regressors = np.column_stack([INPUT, np.ones(INPUT.size)])[skip:]
     expected = np.sqrt(np.diag(np.linalg.inv(regressors.T @ regressors)))
     assert found.names == ("a", "b")
@@ -36,10 +36,10 @@ def test_the_bound_of_a_linear_model_is_that_of_its_regressors(skip):
 
 def test_bounds_and_scale_of_the_search_do_not_change_the_bound():
     theta = np.array([2.0, 1.0])
-    linear = cramer_rao_bound(problem(), theta)
+    linear = cramer_rao_bound(build_problem(), theta)
     changed = {"a": {"lower": 0.5, "upper": 200.0, "scale": "log"}, "b": {"lower": 1.0}}
     np.testing.assert_allclose(
-        cramer_rao_bound(problem(parameters=changed), theta).stderr, linear.stderr, rtol=1e-4
+        cramer_rao_bound(build_problem(parameters=changed), theta).stderr, linear.stderr, rtol=1e-4
     )
 
 
@@ -49,12 +49,12 @@ def test_a_product_of_which_the_data_tell_no_factor_has_none_but_the_others_keep
         "outputs": {"y": "a*c*u(t) + b + x"},
         "parameters": {**LINE["parameters"], "c": {"lower": 0.1, "upper": 10}},
     }
-    found = cramer_rao_bound(problem(document), np.array([1.0, 1.0, 2.0]))
+    found = cramer_rao_bound(build_problem(document), np.array([1.0, 1.0, 2.0]))
     known = dict(zip(found.names, found.stderr.tolist(), strict=True))
     assert np.isinf(known["a"])
     assert np.isinf(known["c"])
     assert known["b"] == pytest.approx(
-        cramer_rao_bound(problem(), np.array([2.0, 1.0])).stderr[1], rel=1e-5
+        cramer_rao_bound(build_problem(), np.array([2.0, 1.0])).stderr[1], rel=1e-5
     )
     assert found.response_rms == pytest.approx(np.sqrt(2 / 200))
 
@@ -64,7 +64,7 @@ def test_no_least_squares_estimate_is_better_than_the_bound_and_its_spread_reach
     regressors = np.column_stack([INPUT, np.ones(INPUT.size)])
     noisy = (regressors @ [2.0, 1.0])[:, None] + 0.3 * generator.standard_normal((200, 4000))
     spread = np.std(np.linalg.lstsq(regressors, noisy, rcond=None)[0], axis=1)
-    least = 0.3 * cramer_rao_bound(problem(), np.array([2.0, 1.0])).stderr
+    least = 0.3 * cramer_rao_bound(build_problem(), np.array([2.0, 1.0])).stderr
     np.testing.assert_allclose(spread, least, rtol=0.05)
 
 

@@ -12,8 +12,8 @@ from sysid.language.functions import Interval
 from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.intervals import keep_in_bounds, mark_poor_intervals
-from tests.models import LINE
-from tests.searching import example
+from tests.support.library.search_problems import example
+from tests.support.library.small_models import LINE
 
 PROBLEM = example(n=80)
 ESTIMATE = replace(
@@ -26,7 +26,7 @@ ESTIMATE = replace(
 )
 
 
-def scaled(lower: float, upper: float, scale: str, interval: Interval) -> tuple[str, str]:
+def mark_interval(lower: float, upper: float, scale: str, interval: Interval) -> tuple[str, str]:
     """Status and reason of an estimate with these bounds and this interval."""
     bounds = {"lower": lower, "upper": upper, "scale": scale}
     problem = PROBLEM.rebuild(parameters={ESTIMATE.name: bounds})
@@ -53,7 +53,7 @@ def scaled(lower: float, upper: float, scale: str, interval: Interval) -> tuple[
 def test_an_interval_around_zero_that_covers_much_of_the_range_says_little(
     lower: float, upper: float, scale: str, interval: Interval, reason: str
 ) -> None:
-    status, found = scaled(lower, upper, scale, interval)
+    status, found = mark_interval(lower, upper, scale, interval)
     assert status == ("unidentifiable" if reason else "identified")
     assert found.startswith(reason) if reason else not found
 

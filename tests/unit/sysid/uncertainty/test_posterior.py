@@ -22,7 +22,7 @@ from sysid.uncertainty.posterior import (
     describe_posterior,
     sample_posterior,
 )
-from tests.searching import example
+from tests.support.library.search_problems import example
 
 LINE: dict[str, Any] = {
     "name": "line",

@@ -14,12 +14,12 @@ from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.profile_likelihood import compute_profile
-from tests.searching import DUFFING, STEP, example, noisy, record
+from tests.support.library.search_problems import DUFFING, STEP, example, noisy, record
 
 TRUTH = np.array([DUFFING[name] for name in ("c", "L", "b", "a")])
 
 
-def linear(
+def build_linear(
     n: int = 400, sd: float = 0.3, pole: float = 0.0, **bounds: float
 ) -> tuple[Problem, FloatArray]:
     """A straight line in sin and cos of the sample number, and its estimate.
@@ -56,7 +56,7 @@ def linear(
 
 @pytest.mark.parametrize("name", ["p", "q"])
 def test_where_the_model_is_linear_the_interval_is_that_of_the_t_distribution(name: str) -> None:
-    problem, theta = linear()
+    problem, theta = build_linear()
     found = compute_profile(problem, theta, name)
     estimate = next(e for e in analyse_estimate(problem, theta).estimates if e.name == name)
     assert estimate.interval95 is not None
@@ -69,7 +69,7 @@ def test_where_the_model_is_linear_the_interval_is_that_of_the_t_distribution(na
 def test_where_the_residuals_are_coloured_profile_and_standard_error_mean_the_same(
     name: str,
 ) -> None:
-    problem, theta = linear(pole=0.8)
+    problem, theta = build_linear(pole=0.8)
     analysis = analyse_estimate(problem, theta)
     assert analysis.uncertainty is not None
     assert analysis.uncertainty.noise_colour == "coloured"
@@ -82,7 +82,7 @@ def test_where_the_residuals_are_coloured_profile_and_standard_error_mean_the_sa
 
 
 def test_the_ratio_is_that_of_the_sums_of_squares_with_the_others_at_their_best() -> None:
-    problem, theta = linear()
+    problem, theta = build_linear()
     found = compute_profile(problem, theta, "p", points=7)
     u = problem.records[0].inputs[0].values[1:]
     y = problem.records[0].outputs[0].values[1:]
@@ -115,7 +115,7 @@ def test_intervals_of_example_1_cover_the_truth(name: str) -> None:
 
 
 def test_an_end_beyond_the_bound_is_open() -> None:
-    problem, theta = linear(upper=1.001)
+    problem, theta = build_linear(upper=1.001)
     found = compute_profile(problem, theta, "p")
     assert found.interval[0] is not None
     assert found.interval[1] is None
@@ -123,14 +123,14 @@ def test_an_end_beyond_the_bound_is_open() -> None:
 
 
 def test_a_profile_that_is_stopped_says_so() -> None:
-    problem, theta = linear()
+    problem, theta = build_linear()
     found = compute_profile(problem, theta, "p", should_stop=lambda: True)
     assert not found.is_complete
     assert found.interval == (None, None)
 
 
 def test_what_cannot_be_profiled_is_refused() -> None:
-    problem, theta = linear()
+    problem, theta = build_linear()
     with pytest.raises(InvalidSettings, match="no free parameter 'r'"):
         compute_profile(problem, theta, "r")
     with pytest.raises(InvalidSettings, match="need 3 or more"):
@@ -149,7 +149,7 @@ def test_intervals_of_example_1_are_nearly_those_of_the_covariance(name: str) ->
 
 
 def test_where_the_profile_is_begun_does_not_matter() -> None:
-    problem, theta = linear()
+    problem, theta = build_linear()
     beside = compute_profile(problem, theta + np.array([0.3, -0.2]), "p")
     there = compute_profile(problem, theta, "p")
     assert beside.interval == pytest.approx(there.interval, rel=1e-4)

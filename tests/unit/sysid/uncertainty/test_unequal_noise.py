@@ -20,9 +20,9 @@ from sysid.uncertainty.unequal_noise import (
     describe_unequal_noise,
     fit_unequal_noise,
 )
-from tests.models import LINE
-from tests.profiles import draw_seeds
-from tests.rates import bound_count
+from tests.support.library.small_models import LINE
+from tests.support.profiles import draw_seeds
+from tests.support.random_bounds import bound_count
 
 MODEL = parse_model(LINE)
 TRUTH = np.array([2.0, 1.0])

@@ -1,0 +1,1 @@
+"""What tests share: the checkout, time limits, profiles, what a machine may lack."""

@@ -1,0 +1,1 @@
+"""Dispatchers, Ray and nodes for tests."""

@@ -1,0 +1,1 @@
+"""Files as lagid and other programs write them."""

@@ -1,0 +1,1 @@
+"""Models, records, twins and exported programs for tests of the numerical core."""

@@ -1,0 +1,1 @@
+"""The web application, its server, commands and jobs for tests of the service."""
