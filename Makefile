@@ -118,7 +118,7 @@ bench-full: $(READY)
 
 # The contract of the interface, after a change of it: OpenAPI document and types of the client.
 openapi: $(READY)
-	$(BIN)/python -m service.api.write_contract .
+	$(BIN)/python -m service.api.contract.write_contract .
 
 mutants: $(READY)
 	$(BIN)/python -m tests.mutants -j 2

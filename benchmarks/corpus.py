@@ -25,7 +25,7 @@ import yaml
 
 from benchmarks.systems import OTHERS, PAPER
 from lagid import GeneticAlgorithm, Identification, Loss, Noise, identify, simulate
-from service.jobs.results import write_result_document
+from service.jobs.stored_results import write_result_document
 from sysid.core.types import FloatArray
 
 Table = dict[str, FloatArray]

@@ -27,10 +27,10 @@ from benchmarks.equivalents import (
 from benchmarks.table import Row, Skipped, parser, report
 from sysid.core.code_cache import load_code, store_code
 from sysid.data.records import Channel, Record
-from sysid.kernels.build import compute_kernel_key
+from sysid.kernels.compilation.build import compute_kernel_key
+from sysid.kernels.compilation.machine_code import compile_assembly
 from sysid.kernels.kernel import emit_kernel
 from sysid.kernels.layout import KernelVariant
-from sysid.kernels.machine_code import compile_assembly
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem

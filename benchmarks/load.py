@@ -34,10 +34,10 @@ from service.core.settings import Settings
 from service.core.states import JobState
 from service.datasets.datasets import add_recording
 from service.dispatch.dispatcher import Dispatcher
-from service.dispatch.leases import HeldLeases
-from service.jobs.schemas import JobIn
+from service.dispatch.held_leases import HeldLeases
+from service.jobs.job_schemas import JobIn
 from service.jobs.submit import submit_job
-from service.repositories.events import EventRepository
+from service.repositories.event_rows import EventRepository
 from service.storage.migrate import upgrade_database
 from service.storage.objects import open_store
 from service.storage.sessions import Database

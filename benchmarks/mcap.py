@@ -12,7 +12,7 @@ sys.path[:] = [entry for entry in sys.path if Path(entry).resolve() != Path(__fi
 import numpy as np
 
 from benchmarks.table import Row, parser, report
-from service.formats.mcap import read_mcap, write_recording
+from service.formats.mcap.mcap_files import read_mcap, write_recording
 from sysid.data.records import Channel, Recording
 
 SAMPLES = 1_000_000

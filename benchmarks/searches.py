@@ -11,7 +11,7 @@ from sysid.core.settings import GeneticAlgorithm, SearchMethod, Stop
 from sysid.core.types import FloatArray
 from sysid.identification.conclude import conclude_run
 from sysid.identification.run import advance_run, begin_run
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.search.state import Improvement
 from sysid.simulation.problem import Problem
 

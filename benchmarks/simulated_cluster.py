@@ -29,11 +29,11 @@ from service.core.settings import Settings
 from service.core.states import OPEN_STATES, JobState
 from service.datasets.datasets import add_recording
 from service.dispatch.dispatcher import Dispatcher
-from service.dispatch.leases import HeldLeases
-from service.jobs.schemas import JobIn
+from service.dispatch.held_leases import HeldLeases
+from service.jobs.job_schemas import JobIn
 from service.jobs.submit import submit_job
 from service.queue.packed_results import PackedResults, PackedRows
-from service.repositories.jobs import JobRepository
+from service.repositories.job_rows import JobRepository
 from service.storage.migrate import upgrade_database
 from service.storage.objects import open_store
 from service.storage.sessions import Database

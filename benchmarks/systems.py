@@ -16,7 +16,7 @@ from sysid.data.records import Channel, Record
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
-from sysid.simulation.metrics import rms
+from sysid.simulation.fit_metrics import rms
 from sysid.simulation.problem import Problem
 
 STEP = 0.02

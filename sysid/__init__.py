@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from sysid.data.records import Recording as Recording
     from sysid.data.table_rules import ReadingNote as ReadingNote
     from sysid.export.export import export_model as export_model
-    from sysid.export.load import load_identified as load_identified
+    from sysid.export.load_export import load_identified as load_identified
     from sysid.identification.identify import identify as identify
     from sysid.models.catalogue.load import catalogue as catalogue
     from sysid.models.catalogue.load import load_model as load_model

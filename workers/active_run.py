@@ -8,7 +8,7 @@ from sysid.identification.run import (
     find_next_border,
     is_finished,
 )
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.search.island import Island
 from workers.packing import MeanCost, choose_slice_seconds, is_worth_spreading
 from workers.protocol import (

@@ -12,7 +12,7 @@ from sysid.core.settings import FitSettings, GeneticAlgorithm
 from sysid.data.noise import Noise
 from sysid.data.records import Record
 from sysid.identification.fingerprint import compute_fingerprint
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.results.identification import Identification
 from sysid.search.island import Island
 

@@ -21,7 +21,7 @@ from sysid.identification.fit_problems import (
 )
 from sysid.identification.run import CALL_SECONDS, advance_island, begin_run, is_finished
 from sysid.identification.run import advance_run as advance_run
-from sysid.kernels.compilation import get_compile_seconds
+from sysid.kernels.compilation.limited_compilation import get_compile_seconds
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.search.island import Island, get_island_settings, split_population

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from benchmarks.breaking.stand import Stand
 from service.core.states import JobState
-from service.repositories.history import unpack_history, unpack_migrants
+from service.repositories.history_rows import unpack_history, unpack_migrants
 from service.storage.retry import TRANSIENT_ERRORS
 from service.storage.tables import Event, Job, MigrationLog, Parcel, Run, RunHistory
 

@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 from lagid import __version__  # noqa: E402 - of this checkout
-from service.pages.guides import format_formula, list_notebooks  # noqa: E402
+from service.pages.documentation.guides import format_formula, list_notebooks  # noqa: E402
 from tests.documents.reference import follow_top_level, write_reference  # noqa: E402
 
 write_reference(ROOT / "docs" / "reference")

@@ -13,8 +13,8 @@ from service.access.scopes import SCOPES, Scope, include_scopes
 from service.access.tokens import hash_secret, is_secret, make_secret, parse_token
 from service.core.errors import OutOfScope, Unauthorized
 from service.core.settings import Settings, is_loopback
-from service.repositories.audit import record_action
-from service.repositories.keys import (
+from service.repositories.audit_rows import record_action
+from service.repositories.key_rows import (
     USE_INTERVAL,
     add_web_session,
     end_web_session,
@@ -22,7 +22,7 @@ from service.repositories.keys import (
     find_session_key,
     note_use,
 )
-from service.repositories.projects import ProjectRepository
+from service.repositories.project_rows import ProjectRepository
 from service.storage.columns import utc_now
 from service.storage.sessions import Database, SessionOwner
 from service.storage.tables import DEFAULT_PROJECT, ApiKey

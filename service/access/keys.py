@@ -8,7 +8,7 @@ from sqlalchemy.orm import Session
 from service.access.scopes import SCOPES, Scope, include_scopes
 from service.access.tokens import hash_secret, make_secret, write_token
 from service.core.errors import InvalidRequest
-from service.repositories.keys import KeyRepository, NewKey
+from service.repositories.key_rows import KeyRepository, NewKey
 from service.storage.columns import utc_now
 from service.storage.tables import ApiKey
 

@@ -5,7 +5,7 @@ import secrets
 from hmac import compare_digest
 from typing import NamedTuple
 
-from service.core.text_checks import find_text_fault
+from service.core.bodies.text_checks import find_text_fault
 
 SECRET_BYTES = 32
 """256 random bits: no list of guesses reaches them, so a plain digest is enough."""

@@ -9,29 +9,29 @@ from starlette.concurrency import run_in_threadpool
 from starlette.middleware.gzip import DEFAULT_EXCLUDED_CONTENT_TYPES, GZipMiddleware
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
-from service.api import (
-    access,
-    datasets,
-    events,
-    figures,
-    health,
-    jobs,
-    models,
-    pages,
-    problems,
-    recipes,
-    references,
-    runs,
-)
-from service.api.access_check import AccessCheck
 from service.api.content import MCAP_TYPE
-from service.api.dependencies import Parts
-from service.api.html import PRIVATE_HEADERS, PROTECTIVE_HEADERS
-from service.api.middleware import BodyLimit, OriginCheck, ResponseHeaders
-from service.api.openapi import DocumentedApp, get_route_name
-from service.api.query_names import check_query_names
-from service.api.request_log import RequestLog
-from service.api.root_path import RootPath
+from service.api.contract.openapi import DocumentedApp, get_route_name
+from service.api.requests import problems
+from service.api.requests.access_check import AccessCheck
+from service.api.requests.dependencies import Parts
+from service.api.requests.html_answers import PRIVATE_HEADERS, PROTECTIVE_HEADERS
+from service.api.requests.middleware import BodyLimit, OriginCheck, ResponseHeaders
+from service.api.requests.query_names import check_query_names
+from service.api.requests.request_log import RequestLog
+from service.api.requests.request_root_path import RootPath
+from service.api.routes import (
+    access_routes,
+    dataset_routes,
+    event_routes,
+    figure_routes,
+    health_routes,
+    job_routes,
+    model_routes,
+    page_routes,
+    recipe_routes,
+    reference_routes,
+    run_routes,
+)
 from service.core.settings import Settings
 from service.queue.orphaned_jobs import Reaper
 from service.storage.open_storage import open_storage
@@ -81,19 +81,19 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(RequestLog)  # the last one is outermost
     # Exact REST paths come first: a page's path may have parameters.
     for router in (
-        health.router,
-        datasets.router,
-        models.router,
-        models.edit_router,
-        jobs.router,
-        recipes.recipe_router,
-        references.reference_router,
-        events.router,
-        runs.comparison_router,
-        runs.router,
-        figures.router,
-        access.router,
-        pages.router,
+        health_routes.router,
+        dataset_routes.router,
+        model_routes.router,
+        model_routes.edit_router,
+        job_routes.router,
+        recipe_routes.recipe_router,
+        reference_routes.reference_router,
+        event_routes.router,
+        run_routes.comparison_router,
+        run_routes.router,
+        figure_routes.router,
+        access_routes.router,
+        page_routes.router,
     ):
         app.include_router(router)
     return app

@@ -21,8 +21,7 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Message, Receive
 
-from service.core import temporary_files
-from service.core.concurrency import MAX_WAIT_SECONDS
+from service.core.bodies.text_checks import parse_digits
 from service.core.errors import (
     InvalidRequest,
     ServiceBusy,
@@ -32,8 +31,9 @@ from service.core.errors import (
     UnsatisfiableRange,
     UnsupportedMediaType,
 )
+from service.core.process import temporary_files
+from service.core.process.concurrency import MAX_WAIT_SECONDS
 from service.core.settings import Settings
-from service.core.text_checks import parse_digits
 from service.datasets.datasets import check_upload_size
 
 MCAP_TYPE, FILE_TYPE = "application/x-mcap", "application/octet-stream"

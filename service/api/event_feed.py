@@ -17,10 +17,10 @@ from threading import Event as Flag
 from starlette.concurrency import run_in_threadpool
 
 from service.core.errors import ServiceBusy
-from service.repositories.events import EventRepository, JobHead
-from service.storage.errors import RowNotFound
+from service.repositories.event_rows import EventRepository, JobHead
 from service.storage.retry import TRANSIENT_ERRORS, is_transient
 from service.storage.sessions import Database
+from service.storage.storage_errors import RowNotFound
 from service.storage.tables import Event
 
 MAX_BATCH_EVENTS = 500

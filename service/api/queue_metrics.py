@@ -6,11 +6,11 @@ Every web process gives the same ones. A dashboard takes their maximum.
 from prometheus_client import REGISTRY, CollectorRegistry, Gauge, generate_latest
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.core import metrics
+from service.core.process import service_metrics
 from service.queue.dispatchers import DispatcherRepository, describe_start
 from service.queue.queue_state import read_queue_state
 from service.storage.sessions import Database
-from sysid.kernels.compilation import get_compile_seconds
+from sysid.kernels.compilation.limited_compilation import get_compile_seconds
 
 
 def write_metrics(database: Database) -> bytes:
@@ -18,7 +18,7 @@ def write_metrics(database: Database) -> bytes:
 
     Without the database, those of the process remain: that is when they are looked at.
     """
-    metrics.record_kernel_seconds("process", get_compile_seconds())
+    service_metrics.record_kernel_seconds("process", get_compile_seconds())
     queue = CollectorRegistry()
     is_up = Gauge("lagid_database_up", "Whether the database answers.", registry=queue)
     try:

@@ -4,8 +4,8 @@ import logging
 import time
 from threading import Lock
 
-from service.storage.errors import ObjectStoreFailed
 from service.storage.objects import ObjectStore
+from service.storage.storage_errors import ObjectStoreFailed
 
 _log = logging.getLogger(__name__)
 

@@ -21,10 +21,10 @@ from rich.console import Console
 from rich.table import Table
 
 from service.client.calls import DEFAULT_URL, NotFinite, ProblemError
-from service.core.documents import parse_yaml
+from service.core.bodies.text_checks import escape_controls
+from service.core.bodies.user_documents import parse_yaml
 from service.core.errors import FieldError, InvalidRequest
-from service.core.text import format_value
-from service.core.text_checks import escape_controls
+from service.core.label_text import format_value
 from sysid.core.errors import join_pointer, split_pointer
 from sysid.core.files import open_replacement
 from sysid.core.text import DASH, plain_estimate, rewrite_settings

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from service.cli.common import format_estimate
-from service.cli.server import load_settings
+from service.cli.server_processes import load_settings
 from service.client.client import Client
 from service.client.embedded import run_embedded_service
 from sysid.identification import warmup

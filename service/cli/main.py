@@ -66,7 +66,7 @@ _PANELS: Mapping[str, Mapping[str, tuple[Callable[..., None] | str, *tuple[str, 
     "Try it": {
         "demo": (run_demo, "lagid demo", "lagid demo --data-dir /tmp/demo"),
         "identify": (
-            "identify:identify",
+            "identify_command:identify",
             "lagid identify recording.csv --model fopdt",
             "lagid identify recording.csv --model mine.yaml --channels u=P1,y=P2",
             "lagid identify recording.csv --model tube --set parameters.L.upper=0.5",
@@ -75,64 +75,64 @@ _PANELS: Mapping[str, Mapping[str, tuple[Callable[..., None] | str, *tuple[str, 
     },
     "Data and models": {
         "datasets": (
-            "datasets:list_datasets",
+            "dataset_commands:list_datasets",
             "lagid datasets",
             "lagid datasets --name tube --json",
         ),
-        "dataset": ("datasets:app",),
-        "models": ("models:app",),
+        "dataset": ("dataset_commands:app",),
+        "models": ("model_commands:app",),
     },
     "Jobs": {
         "submit": (
-            "jobs:submit_job",
+            "job_commands:submit_job",
             "lagid submit job.yaml --wait",
             "lagid submit - --json < job.yaml",
         ),
-        "watch": ("jobs:watch_job", "lagid watch job_1", "lagid watch job_1 --quiet --json"),
+        "watch": ("job_commands:watch_job", "lagid watch job_1", "lagid watch job_1 --quiet --json"),
         "jobs": (
-            "jobs:list_jobs",
+            "job_commands:list_jobs",
             "lagid jobs --state running",
             "lagid jobs --tag night --since 2026-01-31",
         ),
-        "cancel": ("jobs:cancel_job", "lagid cancel job_1"),
-        "resume": ("jobs:resume_job", "lagid resume job_1"),
-        "job": ("jobs:app",),
-        "sweep": ("sweeps:app",),
+        "cancel": ("job_commands:cancel_job", "lagid cancel job_1"),
+        "resume": ("job_commands:resume_job", "lagid resume job_1"),
+        "job": ("job_commands:app",),
+        "sweep": ("sweep_command:app",),
         "reidentify": (
-            "reidentify:reidentify",
+            "reidentify_command:reidentify",
             "lagid reidentify --model tube --label length_m 5=a.csv 10=b.csv --wait",
             "lagid reidentify --model tube --label length_m --reference tube 30=new.csv",
         ),
     },
     "Results": {
-        "runs": ("runs:app",),
+        "runs": ("run_commands:app",),
         "export": (
-            "runs:export_model",
+            "run_commands:export_model",
             "lagid export run_1 --format c --output model.c",
             "lagid export run_1 --json",
         ),
-        "report": ("jobs:write_report", "lagid report job_1 --output tube.html"),
-        "references": ("reidentify:app",),
+        "report": ("job_commands:write_report", "lagid report job_1 --output tube.html"),
+        "references": ("reidentify_command:app",),
     },
     "Server": {
         "serve": (
-            "server:serve",
+            "server_processes:serve",
             "lagid serve",
             "lagid serve --port 8001 --data-dir measurements --cpus 4",
         ),
-        "dispatcher": ("server:run_dispatcher", "lagid dispatcher --cpus 8"),
-        "key": ("access:key_app",),
-        "project": ("access:project_app",),
-        "audit": ("access:list_audit_log", "lagid audit", "lagid audit --project tubes --json"),
-        "backup": ("backup:write_backup", "lagid backup lagid.zip"),
+        "dispatcher": ("server_processes:run_dispatcher", "lagid dispatcher --cpus 8"),
+        "key": ("access_commands:key_app",),
+        "project": ("access_commands:project_app",),
+        "audit": ("access_commands:list_audit_log", "lagid audit", "lagid audit --project tubes --json"),
+        "backup": ("backup_commands:write_backup", "lagid backup lagid.zip"),
         "restore": (
-            "backup:restore_backup",
+            "backup_commands:restore_backup",
             "lagid restore lagid.zip --data-dir restored",
             "lagid restore lagid.zip --force",
         ),
-        "db": ("retention:app",),
-        "health": ("health:check_health", "lagid health web", "lagid health dispatcher"),
-        "doctor": ("server:check_installation", "lagid doctor", "lagid doctor --json"),
+        "db": ("retention_command:app",),
+        "health": ("health_command:check_health", "lagid health web", "lagid health dispatcher"),
+        "doctor": ("server_processes:check_installation", "lagid doctor", "lagid doctor --json"),
     },
 }
 
@@ -214,7 +214,7 @@ def _usage_message(error: TyperException) -> str:
         return ""
     cause: Any = error.__cause__
     if hasattr(cause, "errors"):  # from Pydantic, which reads the values of options
-        from service.core.validation import describe_error
+        from service.core.bodies.validation import describe_error
 
         text = text.replace(error.message, describe_error(cause.errors()[0], ()))
     context = getattr(error, "ctx", None)
@@ -245,7 +245,7 @@ def _user_message(error: Exception) -> str | None:
 
     if isinstance(error, UnicodeEncodeError) and error.reason == SURROGATE_REASON:
         return f"{error.object[:200]!r} is not UTF-8 text; encode it in UTF-8"
-    storage = sys.modules.get("service.storage.errors")  # the library alone has no storage
+    storage = sys.modules.get("service.storage.storage_errors")  # the library alone has no storage
     kinds = (SysidError,) if storage is None else (SysidError, storage.StorageError)
     return str(error) if isinstance(error, kinds) else None
 

@@ -14,8 +14,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from service.cli.common import Document, PlainConsole, err
 from service.client.calls import TERMINAL_STATES
-from service.core.text import format_duration, format_value
-from service.core.text_checks import escape_controls
+from service.core.bodies.text_checks import escape_controls
+from service.core.label_text import format_duration, format_value
 from sysid.core.text import plain_unit
 
 if TYPE_CHECKING:

@@ -21,8 +21,8 @@
     - Misconfigured               the settings are invalid (command line only)
     - ServiceDidNotStart          `lagid serve` ended or was not ready in time (command line only)
 
-One handler (`service.api.problems`) builds the RFC 9457 problem document. This module imports no
-heavy library, so that the light client can use it.
+One handler (`service.api.requests.problems`) builds the RFC 9457 problem document. This module
+imports no heavy library, so that the light client can use it.
 """
 
 from collections.abc import Iterable, Mapping

@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from service.core.errors import Misconfigured
-from service.core.logs import LogFormat
+from service.core.process.logs import LogFormat
 
 
 def make_sqlite_url(path: Path) -> str:

@@ -13,11 +13,10 @@ from typing import Any, Literal
 import numpy as np
 from sqlalchemy.orm import Session
 
-from service.core import temporary_files
 from service.core.errors import DatasetNotFound, TooLarge
+from service.core.process import temporary_files
 from service.core.settings import Settings
-from service.datasets.recordings import load_recording
-from service.datasets.schemas import (
+from service.datasets.dataset_schemas import (
     DatasetOut,
     DatasetPage,
     DeriveIn,
@@ -27,26 +26,27 @@ from service.datasets.schemas import (
     SignalsOut,
     TombstoneOut,
 )
+from service.datasets.stored_recordings import load_recording
 from service.formats.file_kinds import SUFFIXES, detect_kind
-from service.formats.mcap import write_recording
+from service.formats.mcap.mcap_files import write_recording
 from service.formats.sandbox import read_untrusted
-from service.repositories.datasets import DatasetRepository, NewDataset, StoredDataset
-from service.repositories.lineage import (
+from service.repositories.dataset_rows import DatasetRepository, NewDataset, StoredDataset
+from service.repositories.lineage_rows import (
     LineageRepository,
     Relation,
     find_datasets_by_name,
     find_tombstones,
     list_dataset_names,
 )
-from service.repositories.search import NO_FILTER, ListFilter
-from service.storage.errors import RowNotFound
+from service.repositories.search_conditions import NO_FILTER, ListFilter
 from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database
+from service.storage.storage_errors import RowNotFound
 from service.storage.tables import Dataset
 from sysid.core.errors import suggest_name
 from sysid.data.records import Channel, Recording
 from sysid.figures.decimate import decimate
-from sysid.models.units import list_unknown_unit_warnings
+from sysid.models.unit_checks import list_unknown_unit_warnings
 
 
 def read_lineage(session: Session, dataset_id: str) -> LineageOut:

@@ -7,10 +7,10 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
+from service.datasets.dataset_schemas import SimulateIn
 from service.datasets.datasets import add_recording, hash_source
-from service.datasets.schemas import SimulateIn
 from service.datasets.waveforms import InputSignals
-from service.repositories.datasets import DatasetRepository, StoredDataset
+from service.repositories.dataset_rows import DatasetRepository, StoredDataset
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
 from sysid.core.errors import InvalidRecord, suggest_name

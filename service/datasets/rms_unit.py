@@ -6,8 +6,8 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.models.models import load_stored_model
-from service.repositories.datasets import DatasetRepository
-from service.storage.errors import RowNotFound
+from service.repositories.dataset_rows import DatasetRepository
+from service.storage.storage_errors import RowNotFound
 from sysid.core import text
 from sysid.core.errors import InvalidModel
 

@@ -7,22 +7,22 @@ from typing import Any
 import numpy as np
 from sqlalchemy.orm import Session
 
-from service.core.concurrency import simulation_limit
 from service.core.errors import FieldError, InvalidRequest
+from service.core.process.concurrency import simulation_limit
+from service.datasets.dataset_schemas import InputIn, SimulateIn
 from service.datasets.datasets import add_recording, describe_recording, hash_source
 from service.datasets.plants import simulate_plant
-from service.datasets.schemas import InputIn, SimulateIn
 from service.datasets.waveforms import InputSignals
 from service.models import models
-from service.repositories.datasets import DatasetRepository, StoredDataset, build_dataset_row
+from service.repositories.dataset_rows import DatasetRepository, StoredDataset, build_dataset_row
 from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
 from sysid.core.errors import InvalidSettings, suggest_name
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
-from sysid.models.delays import check_delays
 from sysid.models.model import DerivedInitial, FixedInitial, Model
+from sysid.models.model_delays import check_delays
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,7 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
-from service.datasets.recordings import load_recording
-from service.datasets.schemas import (
+from service.datasets.dataset_schemas import (
     BinaryInput,
     DatasetInput,
     ExpressionInput,
@@ -18,7 +17,8 @@ from service.datasets.schemas import (
     StepInput,
     WaveInput,
 )
-from service.repositories.datasets import DatasetRepository
+from service.datasets.stored_recordings import load_recording
+from service.repositories.dataset_rows import DatasetRepository
 from service.storage.objects import ObjectStore
 from sysid.core.errors import InvalidRecord
 from sysid.core.types import FloatArray

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from service.core.errors import ServiceError
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.search.archive import make_archive
 from sysid.search.island import Island, to_improvements
 from sysid.search.state import (

@@ -17,16 +17,16 @@ from types import FrameType
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.core import metrics
 from service.core.errors import Misconfigured
-from service.core.logs import bind_ids
+from service.core.process import service_metrics
+from service.core.process.logs import bind_ids
 from service.core.settings import Settings
 from service.dispatch.background import BackgroundJobs, DocumentMaker
 from service.dispatch.held_jobs import HeldJob, choose_first_size
+from service.dispatch.held_leases import HeldLeases
 from service.dispatch.job_end import build_end_maker
 from service.dispatch.job_parts import JobParts
 from service.dispatch.job_runs import JobRuns
-from service.dispatch.leases import HeldLeases
 from service.dispatch.overlap import Overlap
 from service.dispatch.recorder import JobSpeed, RunRecorder
 from service.dispatch.start import DispatcherStart
@@ -35,11 +35,11 @@ from service.queue.admission import Admission
 from service.queue.dispatchers import CLUSTER_KEY
 from service.queue.leases import Claim, Lease
 from service.queue.notifications import open_notifier
-from service.storage.errors import LeaseLost, StorageError
 from service.storage.objects import ObjectStore, open_store
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
-from sysid.kernels.compilation import get_compile_seconds
+from service.storage.storage_errors import LeaseLost, StorageError
+from sysid.kernels.compilation.limited_compilation import get_compile_seconds
 from workers.core_sharing import SharedCluster, divide_cores
 from workers.errors import ClusterLost, WorkersError
 from workers.local_ray import LocalRay
@@ -113,7 +113,7 @@ class Dispatcher:
         if self._cluster is not None:
             details[CLUSTER_KEY] = self._cluster.identity
         self._leases.start_heartbeat(details)
-        metrics.cores.set_function(lambda: self._executor.slots)
+        service_metrics.cores.set_function(lambda: self._executor.slots)
         _log.info("ready: %s with %d cores", self._leases.owner, self._executor.slots)
         self._listener.start()
         try:
@@ -141,8 +141,8 @@ class Dispatcher:
             self._end_runs(lease)
         for lease in self._list_ready_to_conclude():
             self._conclude_job(lease)
-        metrics.record_kernel_seconds("process", get_compile_seconds())
-        metrics.record_kernel_seconds("workers", self._scheduler.compile_seconds)
+        service_metrics.record_kernel_seconds("process", get_compile_seconds())
+        service_metrics.record_kernel_seconds("workers", self._scheduler.compile_seconds)
         for recorder in self._list_held_recorders():
             is_ending = recorder.lease in self._ending  # then the write itself decides
             if not is_ending and not self._leases.is_held(recorder.lease):
@@ -247,7 +247,7 @@ class Dispatcher:
                 )
             )
         except LeaseLost as error:  # this process stood still after the claim
-            metrics.lease_losses.labels("owner").inc()
+            service_metrics.lease_losses.labels("owner").inc()
             with bind_lease(claim.lease):
                 _log.warning("the parcel is not taken: %s", error)
             self._leases.forget_lease(claim.lease)
@@ -263,13 +263,13 @@ class Dispatcher:
             project=job.project_id,
             account=job.id,
         )
-        metrics.held_jobs.set(len(self._jobs))
+        service_metrics.held_jobs.set(len(self._jobs))
         runs = f"runs {claim.runs.start} to {claim.runs.stop - 1} of {job.n_runs}"
         with bind_lease(claim.lease):
             _log.info("%s: %s, attempt %d", job.id, runs, claim.lease.attempt)
 
     def _drop_lost_parcel(self, recorder: RunRecorder, error: LeaseLost) -> None:
-        metrics.lease_losses.labels("owner").inc()
+        service_metrics.lease_losses.labels("owner").inc()
         with bind_lease(recorder.lease):
             _log.warning("the parcel is dropped: %s", error)
         self._lost.add(recorder.lease)
@@ -356,7 +356,7 @@ class Dispatcher:
         del held.parcels[lease]
         if not held.parcels:
             del self._jobs[lease.job_id]
-        metrics.held_jobs.set(len(self._jobs))
+        service_metrics.held_jobs.set(len(self._jobs))
 
     def _release_jobs(self, *, lost: bool = False) -> None:
         self._side_jobs.stop()

@@ -13,11 +13,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from service.core.documents import to_finite
-from service.core.json_text import write_json
-from service.dispatch.results import to_history_points, to_migrant_points
-from service.formats.mcap import list_fitted_outputs, write_fitted_outputs
-from service.jobs.results import write_result_document
+from service.core.bodies.json_text import write_json
+from service.core.bodies.user_documents import to_finite
+from service.dispatch.history_points import to_history_points, to_migrant_points
+from service.formats.mcap.mcap_files import list_fitted_outputs, write_fitted_outputs
+from service.jobs.stored_results import write_result_document
 from service.queue.packed_results import (
     HISTORY_ROWS,
     MIGRANT_ROWS,
@@ -29,7 +29,7 @@ from service.queue.packed_results import (
     extract_estimates,
     pack_rows,
 )
-from service.repositories.history import pack_history, pack_migrants
+from service.repositories.history_rows import pack_history, pack_migrants
 from sysid.identification.fingerprint import compute_fingerprint
 from workers import protocol
 from workers.protocol import CompleteRun, Records

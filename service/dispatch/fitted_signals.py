@@ -3,8 +3,8 @@
 import time
 from weakref import WeakSet
 
-from service.storage.errors import ObjectStoreFailed
 from service.storage.objects import ObjectStore
+from service.storage.storage_errors import ObjectStoreFailed
 
 RETRY_SECONDS = 15.0
 """Longest wait for a store that accepts nothing, such as a full disk."""

@@ -15,7 +15,7 @@ from sqlalchemy.orm.attributes import set_committed_value
 from service.dispatch.job_parts import JobParts
 from service.dispatch.job_runs import JobRuns
 from service.dispatch.recorder import JobSpeed
-from service.dispatch.warm_starts import may_wait
+from service.dispatch.run_warm_starts import may_wait
 from service.queue.leases import Claim, Lease
 from service.storage.tables import Job
 

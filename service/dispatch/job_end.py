@@ -5,13 +5,13 @@ from collections.abc import Iterator
 from functools import partial
 
 from service.dispatch.background import DocumentMaker
-from service.dispatch.cramer_rao import build_bounds_maker
 from service.dispatch.job_parts import JobParts
+from service.dispatch.run_cramer_rao import build_bounds_maker
 from service.queue.leases import Lease
 from service.storage.columns import Document
-from service.storage.errors import LeaseLost
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
+from service.storage.storage_errors import LeaseLost
 from service.sweeps.job_summary import STORED_RUNS, store_summary
 
 _log = logging.getLogger(__name__)

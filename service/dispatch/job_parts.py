@@ -6,22 +6,22 @@ from functools import partial
 from itertools import islice
 from typing import Any, NamedTuple
 
+from service.core.bodies.json_pointer import build_run_body
 from service.core.errors import ServiceError
-from service.core.json_pointer import build_run_body
-from service.datasets.recordings import read_records
 from service.datasets.signal_channels import SignalChannels, map_channels
+from service.datasets.stored_recordings import read_records
 from service.dispatch.encoding import ResultEncoder
-from service.dispatch.warm_starts import WarmStarts
+from service.dispatch.run_warm_starts import WarmStarts
 from service.jobs.axes import AxisGroup
 from service.jobs.stored_cells import build_stored_cells, read_axis_groups
 from service.jobs.to_core import read_run_settings
 from service.models.models import load_stored_model
 from service.queue.run_writes import NewRun
-from service.repositories.datasets import DatasetRepository
-from service.storage.errors import StorageError
+from service.repositories.dataset_rows import DatasetRepository
 from service.storage.objects import ObjectStore
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
+from service.storage.storage_errors import StorageError
 from service.storage.tables import Dataset, Job
 from sysid.core.errors import SysidError
 from sysid.core.settings import GeneticAlgorithm

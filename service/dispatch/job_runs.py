@@ -9,18 +9,18 @@ from service.core.errors import ServiceError
 from service.dispatch.checkpoints import UnreadableCheckpoint, unpack_state
 from service.dispatch.job_parts import JobParts
 from service.dispatch.overlap import RunBeside, run_at_once
-from service.dispatch.warm_starts import OpenChains
+from service.dispatch.run_warm_starts import OpenChains
 from service.queue.leases import Claim, LeaseQueue
 from service.queue.previous_attempts import delete_progress
 from service.queue.reuse import find_computed_runs
 from service.queue.run_writes import RunWriter, WaitingRun
-from service.storage.errors import LeaseLost, StorageError
 from service.storage.objects import ObjectStore
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
 from service.storage.statements import CHUNK_ROWS, split_chunks
+from service.storage.storage_errors import LeaseLost, StorageError
 from sysid.core.errors import SysidError
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from workers.protocol import (
     InvalidRun,
     JobEntry,

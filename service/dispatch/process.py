@@ -9,7 +9,7 @@ import sys
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
-from service.core.logs import configure_logging
+from service.core.process.logs import configure_logging
 from service.core.settings import Settings
 from workers.errors import ClusterUnavailable
 from workers.local_ray import LocalRay

@@ -11,12 +11,12 @@ from itertools import accumulate
 
 from sqlalchemy.orm import Session
 
-from service.core import metrics
+from service.core.process import service_metrics
 from service.core.states import JobState
 from service.dispatch.checkpoints import pack_state
 from service.dispatch.fitted_signals import store_signals
+from service.dispatch.history_points import to_history_points, to_migrant_points
 from service.dispatch.overlap import RunBeside, run_at_once
-from service.dispatch.results import to_history_points, to_migrant_points
 from service.queue.leases import Claim, JobProgress, LeaseQueue
 from service.queue.packed_results import PackedResults
 from service.queue.previous_attempts import (
@@ -26,13 +26,13 @@ from service.queue.previous_attempts import (
 )
 from service.queue.reuse import take_over_runs
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories.history import HistoryPoint, MigrantPoint
+from service.repositories.history_rows import HistoryPoint, MigrantPoint
 from service.storage.columns import Document
-from service.storage.errors import ObjectStoreFailed
 from service.storage.objects import ObjectStore
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
-from sysid.islands.state import RunState
+from service.storage.storage_errors import ObjectStoreFailed
+from sysid.islands.run_state import RunState
 from workers.protocol import Encoder, RunFailure
 
 _log = logging.getLogger(__name__)
@@ -230,7 +230,7 @@ class RunRecorder:
     def record_progress(self, run: str, state: RunState, seconds: float) -> None:
         """Record a state from which the run can continue."""
         live = self._live.get(run)
-        metrics.evaluations.inc(max(0, state.evaluations - self._count_evaluations(run)))
+        service_metrics.evaluations.inc(max(0, state.evaluations - self._count_evaluations(run)))
         if live is None:
             begun_at = state.generation if run in self._checkpoint_evaluations else 0
             live = self._live[run] = _LiveRun(state, seconds, begun_at)
@@ -247,8 +247,8 @@ class RunRecorder:
             for run in packed.runs:
                 self._checkpoint_evaluations.pop(run, None)
                 self._end_live_run(run)
-        metrics.evaluations.inc(max(0, packed.evaluations - counted))
-        metrics.runs.labels("succeeded").inc(len(packed.runs))
+        service_metrics.evaluations.inc(max(0, packed.evaluations - counted))
+        service_metrics.runs.labels("succeeded").inc(len(packed.runs))
         for run, estimates in packed.estimates.items():
             self._report_end(run, estimates)
         self._evaluations += packed.evaluations
@@ -260,14 +260,14 @@ class RunRecorder:
     def record_failure(self, run: str, failure: RunFailure) -> None:
         """Record that the run failed."""
         self._report_end(run, None)
-        metrics.runs.labels("failed").inc()
+        service_metrics.runs.labels("failed").inc()
         counted = self._count_evaluations(run)
         evaluations = self._checkpoint_evaluations.pop(run, 0)
         live = self._end_live_run(run)
         if live is not None:
             evaluations = live.state.evaluations
         evaluations = failure.evaluations or evaluations
-        metrics.evaluations.inc(max(0, evaluations - counted))
+        service_metrics.evaluations.inc(max(0, evaluations - counted))
         self._evaluations += evaluations
         self._pending.outcomes.append(
             RunOutcome(
@@ -283,7 +283,7 @@ class RunRecorder:
     def record_reuse(self, run: str, source: str) -> None:
         """Record that the run takes over the result of `source`."""
         self._pending.reused[run] = source
-        metrics.runs.labels("reused").inc()
+        service_metrics.runs.labels("reused").inc()
         self._checkpoint_evaluations.pop(run, None)
         self._speed.n_begun += 1  # reused runs do not count for the speed
         self._has_new_progress = True

@@ -11,9 +11,9 @@ from time import monotonic
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.core import metrics
+from service.core.process import service_metrics
 from service.core.settings import Settings
-from service.dispatch.leases import HeldLeases
+from service.dispatch.held_leases import HeldLeases
 from service.queue.dispatchers import STARTING_KEY, StartStep
 from service.storage import migrate
 from service.storage.retry import retry_transient
@@ -47,7 +47,9 @@ class DispatcherStart:
             if self._is_announced:
                 return
             if self._settings.metrics_port is not None:
-                metrics.serve_metrics(self._settings.metrics_host, self._settings.metrics_port)
+                service_metrics.serve_metrics(
+                    self._settings.metrics_host, self._settings.metrics_port
+                )
             # The database may be starting too.
             retry_transient(partial(migrate.upgrade_database, self.database))
             self._tell()
@@ -57,7 +59,7 @@ class DispatcherStart:
         """Compile the search, or load it, unless that was done; wait for another thread's."""
         with self._compile_lock:
             if "search" in self._waits_for:
-                with metrics.time_compilation():
+                with service_metrics.time_compilation():
                     warm_up_worker()
                 self.finish("search")
 
@@ -68,7 +70,7 @@ class DispatcherStart:
             if self._waits_for and not self._is_closed:
                 self._tell()
             else:
-                metrics.start_seconds.set(monotonic() - self._begun)
+                service_metrics.start_seconds.set(monotonic() - self._begun)
 
     def close(self) -> None:
         """Take the announcement back, and close the database."""

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import psutil
 
-from service.core.processes import is_stopped
+from service.core.process.process_identity import is_stopped
 from service.core.settings import Settings
 from sysid.core.child_processes import SAFE_FOLDER, build_child_command, build_import_path
 from workers.ray_folders import clear_ray_remains, kill_processes

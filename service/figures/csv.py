@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from itertools import chain
 from typing import Any
 
-from service.core.text import write_csv
+from service.core.label_text import write_csv
 from sysid.figures.plotly import Figure
 
 

@@ -12,9 +12,9 @@ from service.formats.advice import build_period_error
 from service.formats.file_kinds import GZIP_MAGIC, detect_kind, read_head
 from service.formats.limits import DEFAULT_LIMITS, ReadOptions, UploadLimits
 from sysid.core.errors import UnreadableFile
+from sysid.data.foreign_tables import describe_value, is_labelled
 from sysid.data.records import Recording
 from sysid.data.table_rules import tell_notes
-from sysid.data.tables import describe_value, is_labelled
 
 
 @runtime_checkable
@@ -86,7 +86,7 @@ def read_with_notes(
     if isinstance(content, str) and content is not source:
         content = content.encode()
     if isinstance(content, bytes):
-        from service.core.temporary_files import make_temporary_prefix
+        from service.core.process.temporary_files import make_temporary_prefix
 
         with NamedTemporaryFile(prefix=make_temporary_prefix()) as file:
             file.write(content)
@@ -110,7 +110,7 @@ _NO_FILE = " A table is a recording already: give it to identify, or to Recordin
 def _read_file(path: Path, options: ReadOptions) -> tuple[Recording, tuple[str, ...]]:
     if path.is_dir():
         raise UnreadableFile("it is a folder; need a file")
-    from service.formats.csv_recordings import read_csv
+    from service.formats.tabular.csv_recordings import read_csv
 
     sample_time, segments, limits = options.sample_time, options.segments, options.limits
     is_packed = read_head(path).startswith(GZIP_MAGIC)  # unpacking needs limits

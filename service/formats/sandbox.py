@@ -14,11 +14,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from service.core import temporary_files
 from service.core.errors import Unavailable
+from service.core.process import temporary_files
 from service.formats.file_kinds import detect_kind
 from service.formats.limits import DEFAULT_LIMITS, MIB, UploadLimits
-from service.formats.mcap import read_mcap
+from service.formats.mcap.mcap_files import read_mcap
 from sysid.core.child_processes import OUT_OF_PROCESSOR_TIME, run_child
 from sysid.core.errors import Advice, UnreadableFile
 from sysid.data.records import Recording
@@ -59,7 +59,7 @@ def read_untrusted(
     suffix : str
         Suffix of the name that the user gave the file; see `file_kinds.detect_kind`.
     sample_time, segments
-        See `service.formats.csv_recordings.read_csv`.
+        See `service.formats.tabular.csv_recordings.read_csv`.
 
     Raises
     ------

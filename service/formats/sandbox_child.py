@@ -6,13 +6,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from service.core.temporary_files import FULL_DISK_ERRORS
-from service.formats.csv_recordings import read_csv
+from service.core.process.temporary_files import FULL_DISK_ERRORS
 from service.formats.file_kinds import FileKind
 from service.formats.limits import MIB, ReadOptions, UploadLimits
-from service.formats.mcap import read_mcap_with_notes, write_recording
-from service.formats.table_columns import Table
-from service.formats.table_recordings import build_recording
+from service.formats.mcap.mcap_files import read_mcap_with_notes, write_recording
+from service.formats.tabular.csv_recordings import read_csv
+from service.formats.tabular.table_columns import Table
+from service.formats.tabular.table_recordings import build_recording
 from sysid.core.child_processes import limit_resources
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
@@ -77,10 +77,10 @@ def _read_table(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Table
     """Read a table by the library of its kind, which is loaded for it alone."""
     messages: list[str] = []
     if kind == "excel":
-        from service.formats.sheet_files import read_sheets
+        from service.formats.tabular.sheet_files import read_sheets
 
         return read_sheets(path, options, messages), messages
-    from service.formats.column_files import read_matlab, read_numpy, read_parquet
+    from service.formats.tabular.column_files import read_matlab, read_numpy, read_parquet
 
     read = {"numpy": read_numpy, "matlab": read_matlab, "parquet": read_parquet}[kind]
     return read(path, options, messages), messages

@@ -12,7 +12,7 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from service.formats.cells import DATE_ONLY, STAMP
+from service.formats.tabular.cells import DATE_ONLY, STAMP
 from sysid.core.types import IntArray
 
 Order: TypeAlias = Literal["day before the month", "month before the day"]

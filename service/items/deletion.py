@@ -13,16 +13,16 @@ from sqlalchemy.orm import Session
 from service.core.errors import Conflict
 from service.core.states import OPEN_STATES, JobState
 from service.items.items import Item, check_version, lock_item
-from service.repositories.audit import record_action
-from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.lineage import LineageRepository
-from service.repositories.models import ModelRepository
-from service.repositories.outcomes import record_best_run
-from service.repositories.search import ItemKind, delete_terms
+from service.repositories.audit_rows import record_action
+from service.repositories.dataset_rows import DatasetRepository
+from service.repositories.job_rows import JobRepository
+from service.repositories.lineage_rows import LineageRepository
+from service.repositories.model_rows import ModelRepository
+from service.repositories.outcome_rows import record_best_run
+from service.repositories.search_conditions import ItemKind, delete_terms
 from service.storage.columns import utc_now
-from service.storage.errors import RowNotFound
 from service.storage.sessions import find_project
+from service.storage.storage_errors import RowNotFound
 from service.storage.tables import (
     AcceptedReference,
     Dataset,

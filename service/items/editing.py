@@ -6,11 +6,11 @@ from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 from service.core.errors import Conflict, InvalidRequest
+from service.items.item_schemas import EditIn
 from service.items.items import Item, ItemRow, check_version, lock_item
 from service.items.reference_names import check_reference_name
-from service.items.schemas import EditIn
-from service.repositories.audit import AuditAction, record_action
-from service.repositories.search import ItemKind, replace_tags
+from service.repositories.audit_rows import AuditAction, record_action
+from service.repositories.search_conditions import ItemKind, replace_tags
 from service.storage.sessions import find_project
 from service.storage.tables import AcceptedReference, Dataset, Job, SearchTerm
 

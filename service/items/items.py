@@ -10,13 +10,13 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from service.core.errors import NotFound, StaleVersion
-from service.repositories.jobs import JobRepository
-from service.repositories.models import ModelRepository
-from service.repositories.references import ReferenceRepository
-from service.repositories.runs import RunRepository
-from service.repositories.search import ItemKind
-from service.storage.errors import RowNotFound
+from service.repositories.job_rows import JobRepository
+from service.repositories.model_rows import ModelRepository
+from service.repositories.reference_rows import ReferenceRepository
+from service.repositories.run_rows import RunRepository
+from service.repositories.search_conditions import ItemKind
 from service.storage.sessions import find_project
+from service.storage.storage_errors import RowNotFound
 from service.storage.tables import (
     AcceptedReference,
     Dataset,

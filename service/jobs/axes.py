@@ -6,7 +6,7 @@ from math import exp, log, prod
 from typing import Any
 
 from service.core.errors import FieldError
-from service.jobs.schemas import JobIn, SweepAxisIn
+from service.jobs.job_schemas import JobIn, SweepAxisIn
 from sysid.core.errors import split_pointer, suggest_name
 
 # Fields of the job as a whole. A cell cannot change them.

@@ -6,11 +6,12 @@ from typing import Any
 from pydantic import ValidationError
 from sqlalchemy.orm import Session
 
+from service.core.bodies.validation import explain_errors
 from service.core.errors import FieldError, to_field_errors
-from service.core.validation import explain_errors
 from service.datasets.datasets import resolve_dataset
 from service.jobs import warm_starts
 from service.jobs.job_parameters import count_experiments, count_named_experiments
+from service.jobs.job_schemas import JobIn
 from service.jobs.record_checks import (
     collect_faults,
     find_channel_faults,
@@ -23,13 +24,12 @@ from service.jobs.record_checks import (
     list_record_lengths,
     override_by_request,
 )
-from service.jobs.schemas import JobIn
 from service.models import models
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
 from sysid.core.settings import Weights
-from sysid.models.delays import check_delays, find_unused_settings
 from sysid.models.model import Model, build_initial_parameters
+from sysid.models.model_delays import check_delays, find_unused_settings
 from sysid.models.parameters import Parameter
 from sysid.models.polynomial import check_candidate_count
 from sysid.models.ties import apply_ties, resolve_ties

@@ -6,11 +6,11 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from service.core.job_fields import DATASETS_PATH, WARM_START_PATH
+from service.core.bodies.job_fields import DATASETS_PATH, WARM_START_PATH
 from service.items.reference_names import RUN_PREFIX
-from service.repositories.lineage import LineageRepository, Relation
-from service.repositories.models import ModelRepository
-from service.repositories.search import Term, add_terms, list_label_terms
+from service.repositories.lineage_rows import LineageRepository, Relation
+from service.repositories.model_rows import ModelRepository
+from service.repositories.search_conditions import Term, add_terms, list_label_terms
 from service.storage.tables import Job
 
 Spec = Mapping[str, Any]

@@ -6,8 +6,8 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from service.repositories.datasets import DatasetRepository
-from service.storage.errors import StorageError
+from service.repositories.dataset_rows import DatasetRepository
+from service.storage.storage_errors import StorageError
 from service.storage.tables import Dataset
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter

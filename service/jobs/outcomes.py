@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 
 from sqlalchemy.orm import Session
 
-from service.core.job_fields import DATASETS_PATH
-from service.jobs.schemas import OutcomeOut
-from service.repositories.outcomes import read_outcome_rows
+from service.core.bodies.job_fields import DATASETS_PATH
+from service.jobs.job_schemas import OutcomeOut
+from service.repositories.outcome_rows import read_outcome_rows
 from service.storage.tables import Job
 
 _PARTS = ("verdict", "warnings")

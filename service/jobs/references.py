@@ -5,14 +5,14 @@ from sqlalchemy.orm import Session
 from service.core.errors import InvalidRequest
 from service.core.states import JobState
 from service.items.reference_names import REFERENCE_PREFIX, check_reference_name, find_name_fault
-from service.jobs.schemas import ReferenceIn, ReferenceOut, ReferencePage
+from service.jobs.job_schemas import ReferenceIn, ReferenceOut, ReferencePage
 from service.jobs.stored_run import load_run
 from service.models.models import have_same_equations
-from service.repositories.jobs import JobRepository
-from service.repositories.references import CurrentReference, ReferenceRepository
-from service.repositories.runs import RunRepository
-from service.repositories.search import NO_FILTER, ListFilter
-from service.storage.errors import InvalidCursor, RowNotFound
+from service.repositories.job_rows import JobRepository
+from service.repositories.reference_rows import CurrentReference, ReferenceRepository
+from service.repositories.run_rows import RunRepository
+from service.repositories.search_conditions import NO_FILTER, ListFilter
+from service.storage.storage_errors import InvalidCursor, RowNotFound
 from service.storage.tables import AcceptedReference, Run
 from sysid.core.errors import suggest_name
 

@@ -9,10 +9,10 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from operator import itemgetter
 from typing import Any
 
-from service.core.json_pointer import build_run_body, get_value
+from service.core.bodies.json_pointer import build_run_body, get_value
 from service.jobs.axes import AxisGroup, SweepCell, build_axis_groups, group_axes, iterate_cells
 from service.jobs.checks import JobChecker
-from service.jobs.schemas import JobIn, SweepIn
+from service.jobs.job_schemas import JobIn, SweepIn
 from service.queue.run_writes import NewRun as StoredCell
 from service.storage.columns import Document
 

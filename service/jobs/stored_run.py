@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 from sqlalchemy.orm import Session
 
+from service.core.bodies.json_pointer import build_run_body
 from service.core.errors import Conflict
-from service.core.json_pointer import build_run_body
-from service.datasets.recordings import read_records
 from service.datasets.rms_unit import find_rms_unit
 from service.datasets.signal_channels import SignalChannels, map_channels
+from service.datasets.stored_recordings import read_records
 from service.jobs.job_parameters import list_job_parameters
-from service.jobs.results import read_result_document
+from service.jobs.stored_results import read_result_document
 from service.jobs.to_core import read_fit, read_noise
 from service.models.models import apply_result, load_stored_model
-from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.runs import RunRepository
+from service.repositories.dataset_rows import DatasetRepository
+from service.repositories.job_rows import JobRepository
+from service.repositories.run_rows import RunRepository
 from service.storage.objects import ObjectStore
 from service.storage.tables import Job, Run
 from sysid.data.records import Record

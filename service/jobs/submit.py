@@ -12,9 +12,9 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest, QuotaExceeded
+from service.core.label_text import name_label
 from service.core.settings import Settings
 from service.core.states import JobState
-from service.core.text import name_label
 from service.datasets.rms_unit import find_rms_unit
 from service.jobs.axes import build_axis_groups, count_runs, group_axes
 from service.jobs.checks import JobChecker
@@ -24,8 +24,8 @@ from service.jobs.job_links import (
     list_used_runs,
     store_job_links,
 )
+from service.jobs.job_schemas import JobIn, JobOut, JobPage, OutcomeOut, ProgressOut
 from service.jobs.outcomes import read_outcomes
-from service.jobs.schemas import JobIn, JobOut, JobPage, OutcomeOut, ProgressOut
 from service.jobs.stored_cells import (
     CELLS_AT_SUBMISSION,
     build_stored_cells,
@@ -35,14 +35,14 @@ from service.jobs.stored_cells import (
 from service.jobs.sweep_checks import find_job_faults
 from service.queue.admission import count_unfinished
 from service.queue.run_writes import NewRun, insert_runs
-from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository, NewJob, Submission
-from service.repositories.projects import ProjectRepository, check_daily_evaluations
-from service.repositories.runs import RunRepository
-from service.repositories.search import NO_FILTER, ListFilter
+from service.repositories.dataset_rows import DatasetRepository
+from service.repositories.job_rows import JobRepository, NewJob, Submission
+from service.repositories.project_rows import ProjectRepository, check_daily_evaluations
+from service.repositories.run_rows import RunRepository
+from service.repositories.search_conditions import NO_FILTER, ListFilter
 from service.storage.columns import utc_now
-from service.storage.errors import RowNotFound
 from service.storage.sessions import Database
+from service.storage.storage_errors import RowNotFound
 from service.storage.tables import Dataset, Job
 
 

@@ -9,9 +9,9 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 from sqlalchemy.orm import Session
 
+from service.core.bodies.json_pointer import build_run_body, get_value
+from service.core.bodies.wire import Seed, Sigma
 from service.core.errors import FieldError
-from service.core.json_pointer import build_run_body, get_value
-from service.core.wire import Seed, Sigma
 from service.jobs import warm_starts
 from service.jobs.axes import (
     AxisPosition,
@@ -22,7 +22,7 @@ from service.jobs.axes import (
     group_axes,
 )
 from service.jobs.checks import JobChecker, find_type_faults
-from service.jobs.schemas import MAX_X, MIN_X, PREVIOUS, JobIn, is_valid_x
+from service.jobs.job_schemas import MAX_X, MIN_X, PREVIOUS, JobIn, is_valid_x
 from sysid.core.errors import suggest_name
 from sysid.models.model import Model
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, NamedTuple
 
-from service.core.derived_bodies import read_settings
+from service.core.bodies.derived_bodies import read_settings
 from sysid.core.settings import FitSettings, GeneticAlgorithm
 from sysid.data.noise import Noise
 from sysid.identification.options import RunOptions

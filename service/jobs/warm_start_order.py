@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from service.jobs.axes import count_values, group_axes
-from service.jobs.schemas import SweepAxisIn
+from service.jobs.job_schemas import SweepAxisIn
 
 
 @dataclass(frozen=True, slots=True)

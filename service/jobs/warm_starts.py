@@ -5,11 +5,11 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
+from service.core.bodies.job_fields import WARM_START_PATH
 from service.core.errors import FieldError, InvalidRequest
-from service.core.job_fields import WARM_START_PATH
 from service.items.reference_names import REFERENCE_PREFIX
 from service.jobs import references
-from service.jobs.schemas import PREVIOUS
+from service.jobs.job_schemas import PREVIOUS
 from service.jobs.stored_run import load_run
 from service.models.models import have_same_equations
 from service.storage.tables import Run

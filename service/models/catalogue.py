@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
+from service.core.bodies.wire import FaultOut
 from service.core.errors import to_field_errors
-from service.core.wire import FaultOut
-from service.models.schemas import CheckOut, EquationOut, ModelOut
+from service.models.model_schemas import CheckOut, EquationOut, ModelOut
 from sysid.core.errors import SysidError
 from sysid.models.catalogue import load
 from sysid.models.equation_display import format_equations

@@ -12,10 +12,10 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest, NotFound
 from service.models.catalogue import list_catalogue, to_builtin_out, to_model_out
-from service.models.schemas import ModelOut, ModelPage
-from service.repositories.models import ModelRepository
-from service.repositories.search import NO_FILTER, ListFilter
-from service.storage import errors
+from service.models.model_schemas import ModelOut, ModelPage
+from service.repositories.model_rows import ModelRepository
+from service.repositories.search_conditions import NO_FILTER, ListFilter
+from service.storage import storage_errors
 from service.storage.tables import ModelVersion as StoredModel
 from sysid.core.errors import InvalidModel, UnknownModel, suggest_name
 from sysid.models.catalogue import load
@@ -128,7 +128,7 @@ def apply_result(model: Model, result: Mapping[str, Any] | None) -> Model:
 def _get_own_model(session: Session, reference: str) -> StoredModel:
     try:
         return ModelRepository(session).get(reference)
-    except errors.RowNotFound:
+    except storage_errors.RowNotFound:
         raise NotFound("model", reference, suggest_name(reference, _list_names(session))) from None
 
 

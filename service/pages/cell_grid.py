@@ -8,10 +8,10 @@ from urllib.parse import urlencode
 
 from sqlalchemy.orm import Session
 
-from service.core.job_fields import SIGMA_PATH
+from service.core.bodies.job_fields import SIGMA_PATH
+from service.core.label_text import format_count, format_value
 from service.core.states import JobState
-from service.core.text import format_count, format_value
-from service.repositories.summaries import SummaryQuantity
+from service.repositories.summary_rows import SummaryQuantity
 from service.storage.columns import to_json
 from service.storage.tables import Job
 from service.sweeps.groups import QUANTILES_PER_MILLE, RunGroup

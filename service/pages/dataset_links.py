@@ -6,13 +6,13 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from service.core.job_fields import DATASETS_PATH
-from service.core.text import format_labels
+from service.core.bodies.job_fields import DATASETS_PATH
+from service.core.label_text import format_labels
 from service.pages.views import sweep_axes
-from service.repositories.datasets import DatasetRepository
-from service.repositories.lineage import LineageRepository
+from service.repositories.dataset_rows import DatasetRepository
+from service.repositories.lineage_rows import LineageRepository
 from service.storage.columns import Document
-from service.storage.errors import RowNotFound
+from service.storage.storage_errors import RowNotFound
 from service.storage.tables import Job
 
 MAX_LISTED_DATASETS = 100

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from service.core.text import format_value
+from service.core.label_text import format_value
 from sysid.core.text import DASH
 
 UNLISTED = ("name", "note", "tags", "priority", "sweep", "trend", "seed")

@@ -9,15 +9,15 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.core.errors import Conflict
-from service.datasets.recordings import load_recording
-from service.formats.mcap import FitRole, FittedOutput
+from service.datasets.stored_recordings import load_recording
+from service.formats.mcap.mcap_files import FitRole, FittedOutput
 from service.jobs.stored_run import StoredRun
-from service.repositories.runs import RunRepository
+from service.repositories.run_rows import RunRepository
 from service.runs.bands import load_bands
 from service.runs.fitted import load_fitted_signals
 from service.runs.residuals import analyse_residuals
-from service.storage.errors import ObjectMissing, RowNotFound
 from service.storage.objects import ObjectStore
+from service.storage.storage_errors import ObjectMissing, RowNotFound
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
 from sysid.figures.data import ExperimentTraces, OutputTraces, SearchTraces, SignalTrace

@@ -15,13 +15,13 @@ from service.items.items import compute_etag
 from service.jobs.outcomes import read_outcomes
 from service.models import models
 from service.models.catalogue import to_builtin_out
-from service.models.schemas import ModelOut, ModelParameterOut
+from service.models.model_schemas import ModelOut, ModelParameterOut
 from service.pages.render import render_template
 from service.pages.views import to_job_view
-from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.models import ModelRepository
-from service.repositories.search import ListFilter
+from service.repositories.dataset_rows import DatasetRepository
+from service.repositories.job_rows import JobRepository
+from service.repositories.model_rows import ModelRepository
+from service.repositories.search_conditions import ListFilter
 from service.storage.tables import ModelVersion
 from sysid.models.catalogue import load
 

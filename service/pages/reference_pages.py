@@ -6,20 +6,20 @@ from urllib.parse import urlencode
 
 from sqlalchemy.orm import Session
 
-from service.core.text import format_labels
+from service.core.label_text import format_labels
 from service.datasets.rms_unit import find_rms_unit
 from service.items.items import compute_etag
 from service.jobs.outcomes import read_outcomes
 from service.jobs.references import get_reference, list_references
 from service.jobs.stored_run import load_run
 from service.pages.render import render_template
-from service.pages.trend import count_trend_flags
+from service.pages.trend_views import count_trend_flags
 from service.pages.views import to_job_view
-from service.repositories.jobs import JobRepository
-from service.repositories.lineage import LineageLink, LineageRepository
-from service.repositories.outcomes import read_estimates
-from service.repositories.references import ReferenceRepository
-from service.repositories.search import ListFilter
+from service.repositories.job_rows import JobRepository
+from service.repositories.lineage_rows import LineageLink, LineageRepository
+from service.repositories.outcome_rows import read_estimates
+from service.repositories.reference_rows import ReferenceRepository
+from service.repositories.search_conditions import ListFilter
 from sysid.core.text import format_unit, join_estimate
 from sysid.uncertainty.estimates import Estimate
 

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from service.core.label_text import TEMPLATE_FILTERS
 from service.core.root_path import get_root_path, to_address
-from service.core.text import TEMPLATE_FILTERS
 from service.pages.result_filters import RESULT_FILTERS
 from sysid.core.settings import GeneticAlgorithm
 

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from service.core.job_fields import DATASETS_PATH
+from service.core.bodies.job_fields import DATASETS_PATH
+from service.core.bodies.wire import Answer
+from service.core.label_text import format_count, format_value
 from service.core.states import OPEN_STATES, JobState, StateName
-from service.core.text import format_count, format_value
-from service.core.wire import Answer
 from service.items.items import compute_etag
+from service.jobs.job_schemas import JobOut, OutcomeOut
 from service.jobs.outcomes import is_batch
-from service.jobs.schemas import JobOut, OutcomeOut
 from service.jobs.stored_run import StoredRun
 from service.jobs.submit import to_job_out
-from service.pages.choices import write_choice
+from service.pages.forms.choices import write_choice
 from service.storage.tables import Event, Job
 from sysid.core.text import rewrite_settings
 

@@ -6,10 +6,10 @@ looks with its heartbeat. A stopped job keeps its results and checkpoints, and c
 
 import logging
 
-from service.repositories.jobs import JobRepository
-from service.repositories.projects import list_overruns
-from service.storage.errors import RowConflict, RowNotFound
+from service.repositories.job_rows import JobRepository
+from service.repositories.project_rows import list_overruns
 from service.storage.sessions import Database, SessionOwner
+from service.storage.storage_errors import RowConflict, RowNotFound
 
 _log = logging.getLogger(__name__)
 

@@ -37,11 +37,11 @@ from sqlalchemy.orm import Session, defer
 from service.core.states import OPEN_STATES, JobState
 from service.queue.admission import Admission, count_running_jobs, is_open
 from service.queue.clocks import Clock, choose_database_clock
-from service.repositories.events import EventKind, EventRepository
-from service.repositories.jobs import end_job, end_open_runs, lock_parcels, notify_queue
+from service.repositories.event_rows import EventKind, EventRepository
+from service.repositories.job_rows import end_job, end_open_runs, lock_parcels, notify_queue
 from service.storage.columns import Document, UtcDateTime
-from service.storage.errors import LeaseLost, RowConflict
 from service.storage.statements import RETURNING_OPTIONS
+from service.storage.storage_errors import LeaseLost, RowConflict
 from service.storage.tables import Checkpoint, Job, Parcel, Run
 
 DEFAULT_LEASE = timedelta(seconds=10)

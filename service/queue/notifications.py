@@ -14,7 +14,7 @@ from sqlalchemy import bindparam, select
 from sqlalchemy.orm import Session
 
 from service.queue.admission import Admission, is_open
-from service.repositories.jobs import QUEUE_CHANNEL
+from service.repositories.job_rows import QUEUE_CHANNEL
 from service.storage.sessions import Database
 from service.storage.tables import Job, Parcel
 

@@ -10,8 +10,8 @@ import threading
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.core import metrics
-from service.core.processes import is_awake, is_gone
+from service.core.process import service_metrics
+from service.core.process.process_identity import is_awake, is_gone
 from service.queue.clocks import Clock
 from service.queue.dispatchers import DispatcherRepository, find_lease_length
 from service.queue.leases import HUNG_AFTER, LeaseOwners, LeaseQueue, ReapResult
@@ -59,7 +59,7 @@ def reap_jobs(
 def _report_reaped(reaped: ReapResult, owners: LeaseOwners) -> None:
     if not reaped.owners:
         return
-    metrics.lease_losses.labels("reaper").inc(
+    service_metrics.lease_losses.labels("reaper").inc(
         len(reaped.requeued) + len(reaped.failed) + len(reaped.cancelled)
     )
     reasons = ", ".join(

@@ -23,7 +23,12 @@ from service.queue.packed_results import (
     RowLayout,
     extract_estimates,
 )
-from service.repositories.history import HistoryPoint, MigrantPoint, pack_history, pack_migrants
+from service.repositories.history_rows import (
+    HistoryPoint,
+    MigrantPoint,
+    pack_history,
+    pack_migrants,
+)
 from service.storage.columns import Document, UtcDateTime, to_json, utc_now
 from service.storage.statements import (
     CHUNK_ROWS,

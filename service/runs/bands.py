@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 from sqlalchemy.orm import Session
 
+from service.core.bodies.user_documents import to_finite
 from service.core.computed import ComputedValues
-from service.core.concurrency import simulation_limit
-from service.core.documents import to_finite
 from service.core.errors import Conflict, InvalidRequest, NotFound
+from service.core.process.concurrency import simulation_limit
 from service.jobs.stored_run import StoredRun, load_estimated_run
 from service.runs.profiles import measure_work, read_estimate
-from service.runs.schemas import BandExperimentOut, BandOut, BandsOut
-from service.storage.errors import ObjectMissing, RowNotFound
+from service.runs.run_schemas import BandExperimentOut, BandOut, BandsOut
 from service.storage.objects import ObjectStore
 from service.storage.sessions import release_connection
+from service.storage.storage_errors import ObjectMissing, RowNotFound
 from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
 from sysid.data.records import Record

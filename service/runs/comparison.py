@@ -8,16 +8,16 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from service.core.documents import to_finite
+from service.core.bodies.user_documents import to_finite
 from service.core.errors import FieldError, InvalidRequest
 from service.jobs.stored_run import StoredRun, load_run
-from service.runs.schemas import (
+from service.runs.run_schemas import (
     ComparedParameterOut,
     ComparedRunOut,
     ComparedValueOut,
     ComparisonOut,
 )
-from service.storage.errors import RowNotFound
+from service.storage.storage_errors import RowNotFound
 from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.value_documents import encode
 from sysid.results.result import Result

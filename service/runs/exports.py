@@ -8,10 +8,10 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest
-from service.core.text import write_csv
+from service.core.label_text import write_csv
 from service.jobs.stored_run import StoredRun, load_estimated_run
-from service.repositories.datasets import DatasetRepository
-from service.storage.errors import StorageError
+from service.repositories.dataset_rows import DatasetRepository
+from service.storage.storage_errors import StorageError
 from service.storage.tables import Dataset
 from sysid.control.linear_form import Covariance, IdentifiedModel, IdentifiedValue, NotLinear
 from sysid.core.errors import InvalidSettings

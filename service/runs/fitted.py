@@ -6,20 +6,20 @@ from itertools import groupby
 from sqlalchemy.orm import Session
 
 from service.core.computed import ComputedValues
-from service.core.concurrency import simulation_limit
 from service.core.errors import Conflict, InvalidRequest, NotFound
+from service.core.process.concurrency import simulation_limit
 from service.core.states import JobState
 from service.datasets.datasets import to_series
-from service.formats.mcap import (
+from service.formats.mcap.mcap_files import (
     FittedOutput,
     list_fitted_outputs,
     read_fitted_outputs,
 )
 from service.jobs.stored_run import StoredRun, load_run
-from service.runs.schemas import ExperimentOut, ResponseOut
-from service.storage.errors import ObjectMissing, RowNotFound
+from service.runs.run_schemas import ExperimentOut, ResponseOut
 from service.storage.objects import ObjectStore
 from service.storage.sessions import release_connection
+from service.storage.storage_errors import ObjectMissing, RowNotFound
 from sysid.core.errors import SysidError
 from sysid.data.records import Channel
 

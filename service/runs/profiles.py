@@ -13,7 +13,7 @@ import numpy as np
 
 from service.core.errors import Conflict, InvalidRequest
 from service.jobs.stored_run import StoredRun, load_estimated_run
-from service.runs.schemas import ProfileIn, ProfileOut, RunProfilesOut
+from service.runs.run_schemas import ProfileIn, ProfileOut, RunProfilesOut
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
 from sysid.core.errors import suggest_name

@@ -12,12 +12,12 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.errors import NotFound, ServiceError
-from service.formats.mcap import FittedOutput
+from service.formats.mcap.mcap_files import FittedOutput
 from service.jobs.stored_run import StoredRun, load_run
 from service.runs.fitted import load_fitted_signals
-from service.runs.schemas import CorrelationOut, ResidualsOut
-from service.storage.errors import StorageError
+from service.runs.run_schemas import CorrelationOut, ResidualsOut
 from service.storage.objects import ObjectStore
+from service.storage.storage_errors import StorageError
 from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
 from sysid.core.value_documents import encode

@@ -13,16 +13,16 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
+from service.core.bodies.json_text import write_json
 from service.core.computed import ComputedValues
 from service.core.errors import InvalidRequest, NotFound
-from service.core.json_text import write_json
 from service.core.states import JobState
-from service.formats.mcap import FittedInput, list_fitted_inputs, write_fitted_outputs
+from service.formats.mcap.mcap_files import FittedInput, list_fitted_inputs, write_fitted_outputs
 from service.jobs.stored_run import StoredRun, load_run
 from service.runs.fitted import load_fitted_signals
-from service.storage.errors import ObjectMissing, RowNotFound
 from service.storage.objects import ObjectStore
 from service.storage.sessions import release_connection
+from service.storage.storage_errors import ObjectMissing, RowNotFound
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
 

@@ -7,14 +7,14 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
+from service.core.bodies.json_pointer import build_run_body
 from service.core.errors import InvalidRequest
-from service.core.json_pointer import build_run_body
 from service.core.states import JobState
 from service.jobs.stored_run import StoredRun, load_run
-from service.repositories.jobs import JobRepository
-from service.repositories.lineage import WrittenProgress, read_written_progress
-from service.repositories.runs import RunOrder, RunRepository
-from service.runs.schemas import (
+from service.repositories.job_rows import JobRepository
+from service.repositories.lineage_rows import WrittenProgress, read_written_progress
+from service.repositories.run_rows import RunOrder, RunRepository
+from service.runs.run_schemas import (
     HistoryOut,
     ImprovementOut,
     MigrantOut,

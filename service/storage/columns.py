@@ -7,9 +7,9 @@ from typing import Any, TypeAlias
 from sqlalchemy import JSON, BigInteger, DateTime, Dialect, Enum, Integer, String, TypeDecorator
 from sqlalchemy.dialects.postgresql import JSONB
 
-from service.core.json_text import write_json
-from service.core.text_checks import find_text_fault
-from service.storage.errors import UnstorableValue
+from service.core.bodies.json_text import write_json
+from service.core.bodies.text_checks import find_text_fault
+from service.storage.storage_errors import UnstorableValue
 
 Document: TypeAlias = dict[str, Any]
 """A JSON object."""

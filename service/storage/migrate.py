@@ -15,8 +15,8 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, func, select
 
 import migrations
-from service.storage.errors import DatabaseNotAtHead, DatabaseUnknown, UnknownRevision
 from service.storage.sessions import Database
+from service.storage.storage_errors import DatabaseNotAtHead, DatabaseUnknown, UnknownRevision
 from service.storage.tables import Base
 
 _LOCK = 0x6C61_6769_64  # "lagid": the key of the advisory lock

@@ -23,8 +23,8 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError, NotFoundError
 from obstore.store import LocalStore, S3Store
 
-from service.core import metrics, temporary_files
-from service.storage.errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
+from service.core.process import service_metrics, temporary_files
+from service.storage.storage_errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
 
 if TYPE_CHECKING:
     from obstore.store import RetryConfig
@@ -284,7 +284,7 @@ def _translate_errors(action: str, sha256: str = "") -> Iterator[None]:
 
 
 def _report_failure(action: str, error: Exception) -> ObjectStoreFailed:
-    metrics.store_errors.labels("objects").inc()
+    service_metrics.store_errors.labels("objects").inc()
     return ObjectStoreFailed(f"the object store cannot {action}: {_take_first_line(error)}")
 
 

@@ -3,7 +3,7 @@
 import tempfile
 from pathlib import Path
 
-from service.core import temporary_files
+from service.core.process import temporary_files
 from service.core.settings import Settings
 from service.storage import migrate
 from service.storage.objects import ObjectStore, open_store

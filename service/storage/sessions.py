@@ -16,8 +16,8 @@ from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 from sqlalchemy.pool import ConnectionPoolEntry
 
-from service.core import metrics
 from service.core.extras import check_extra
+from service.core.process import service_metrics
 from service.storage.columns import to_json
 from service.storage.retry import is_transient
 from service.storage.tables import DEFAULT_PROJECT
@@ -200,7 +200,7 @@ def _count_error(context: ExceptionContext) -> None:
     """Count an error that is the database's own, not one of a statement."""
     error = context.sqlalchemy_exception
     if isinstance(error, DBAPIError) and is_transient(error):
-        metrics.store_errors.labels("database").inc()
+        service_metrics.store_errors.labels("database").inc()
 
 
 def _create_private_file(

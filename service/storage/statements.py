@@ -19,7 +19,7 @@ from sqlalchemy import update as update_of
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
-from service.storage.errors import InvalidCursor
+from service.storage.storage_errors import InvalidCursor
 from service.storage.tables import Base
 
 if TYPE_CHECKING:

@@ -203,9 +203,9 @@ class Job(Base):
     progress over all runs. `best_rms` is the smallest RMS of any run so far. `fit_estimation` is
     the fit (%) of that run once the job has ended, `trust` that of its verdict; a batch has none.
     `n_reused` counts the runs taken over from other jobs. `cramer_rao` is the document that
-    `service.dispatch.cramer_rao` computes for a job with noise. `evaluations_before` is the part of
-    `evaluations` that was made a day or more before the job was resumed: it does not count for the
-    limit of a day.
+    `service.dispatch.run_cramer_rao` computes for a job with noise. `evaluations_before` is the
+    part of `evaluations` that was made a day or more before the job was resumed: it does not count
+    for the limit of a day.
 
     `version` and `fingerprint` are those of the program that last started the job; until then
     `version` is that of the program that took it. `spec_hash` is the digest of its request.
@@ -399,7 +399,7 @@ class StoredSummary(Base):
 
 
 class RunHistory(Base):
-    """Improved champions of the islands of a run, packed by `service.repositories.history`.
+    """Improved champions of the islands of a run, packed by `service.repositories.history_rows`.
 
     `digest` is the hash of `points`. `generation` and `evaluations` are the largest of these
     points, `rms` the smallest.
@@ -417,7 +417,7 @@ class RunHistory(Base):
 
 
 class MigrationLog(Base):
-    """Migrants of a run, packed by `service.repositories.history`; `digest` is their hash."""
+    """Migrants of a run, packed by `service.repositories.history_rows`; `digest` is their hash."""
 
     __tablename__ = "migrations_log"
 
@@ -502,7 +502,7 @@ class IdempotencyKey(Base):
 class DispatcherHeartbeat(Base):
     """Heartbeat of a dispatcher: whether it is alive, and for how many cores it has work.
 
-    `details` tells its process and its Ray cluster (`service.dispatch.leases`).
+    `details` tells its process and its Ray cluster (`service.dispatch.held_leases`).
     """
 
     __tablename__ = "dispatchers"

@@ -14,11 +14,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from service.core.job_fields import SIGMA_PATH
+from service.core.bodies.job_fields import SIGMA_PATH
 from service.core.states import JobState
 from service.jobs.axes import AxisGroup
 from service.jobs.stored_cells import read_axis_groups
-from service.repositories.summaries import RunTable, SummaryQuantity
+from service.repositories.summary_rows import RunTable, SummaryQuantity
 
 QUANTILES_PER_MILLE = (50, 250, 500, 750, 950)
 """Quantiles in thousandths, so that ranks are integers."""

@@ -19,7 +19,7 @@ from sqlalchemy.orm import Session
 from service.core.computed import ComputedValues
 from service.core.states import JobState
 from service.queue.leases import Lease, LeaseQueue
-from service.repositories.summaries import (
+from service.repositories.summary_rows import (
     RunTable,
     SummaryQuantity,
     read_run_table,

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from service.core.errors import FieldError, InvalidRequest
-from service.datasets.recordings import load_recording
+from service.datasets.stored_recordings import load_recording
 from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset
 from sysid.data.records import Recording

@@ -8,13 +8,18 @@ from sqlalchemy.orm import Session
 from service.core.errors import InvalidRequest
 from service.core.states import JobState
 from service.datasets.rms_unit import find_rms_unit
-from service.repositories.jobs import JobRepository
-from service.repositories.summaries import SummaryQuantity
+from service.repositories.job_rows import JobRepository
+from service.repositories.summary_rows import SummaryQuantity
 from service.storage.tables import Job
-from service.sweeps.cramer_rao import StoredBounds, scale_to_sigma
+from service.sweeps.group_cramer_rao import StoredBounds, scale_to_sigma
 from service.sweeps.groups import QUANTILES_PER_MILLE, GroupKey, RunGroup, SweepGroups
 from service.sweeps.job_summary import MAX_GROUPS, list_default_keys, load_groups, load_summary
-from service.sweeps.schemas import ErrorReferenceOut, GroupOut, ParameterSummaryOut, SummaryOut
+from service.sweeps.sweep_schemas import (
+    ErrorReferenceOut,
+    GroupOut,
+    ParameterSummaryOut,
+    SummaryOut,
+)
 from sysid.core.errors import suggest_name
 
 MEDIAN = QUANTILES_PER_MILLE.index(500)

@@ -5,10 +5,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from service.core.text import write_csv
+from service.core.label_text import write_csv
 from service.datasets.rms_unit import find_rms_unit
-from service.repositories.jobs import JobRepository
-from service.repositories.runs import RunRepository
+from service.repositories.job_rows import JobRepository
+from service.repositories.run_rows import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import Run
 from service.sweeps.job_summary import load_summary

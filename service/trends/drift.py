@@ -9,7 +9,7 @@ import numpy as np
 
 from service.storage.tables import Run
 from service.trends.points import TrendQuantity, read_onset_estimates
-from service.trends.schemas import DriftOut
+from service.trends.trend_schemas import DriftOut
 from sysid.core.value_documents import decode
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.trends.trend import Drift, Trend, TrendEstimate, compute_drift, compute_law_drifts

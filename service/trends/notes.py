@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from service.repositories.trends import TrendRow
+from service.repositories.trend_rows import TrendRow
 from service.trends.points import TrendQuantity
 from sysid.core.units import format_unit
 from sysid.trends.trend import Trend, TrendPoint

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from math import inf, isfinite
 from typing import Any, Literal
 
-from service.repositories.trends import TrendRow
-from service.trends.schemas import BatchLabelOut, SpanOut
+from service.repositories.trend_rows import TrendRow
+from service.trends.trend_schemas import BatchLabelOut, SpanOut
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.trends.trend import TrendEstimate, pool_estimates
 

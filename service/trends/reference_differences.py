@@ -8,7 +8,7 @@ from sqlalchemy.orm import Session
 from service.jobs.record_checks import list_signals
 from service.jobs.stored_run import load_run
 from service.models import models
-from service.repositories.datasets import DatasetRepository
+from service.repositories.dataset_rows import DatasetRepository
 from service.storage.tables import Run
 from service.trends.points import DatasetChannels
 from sysid.core.errors import UnknownModel

@@ -28,11 +28,11 @@ from sqlalchemy import Connection
 from service.queue.dispatchers import DispatcherRepository
 from service.storage import migrate
 from service.storage.columns import DocumentType, OrderedJsonType, UtcDateTime, utc_now
-from service.storage.errors import ObjectMissing, StorageError
 from service.storage.garbage import select_hashes
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
 from service.storage.statements import split_chunks
+from service.storage.storage_errors import ObjectMissing, StorageError
 from service.storage.tables import Base, DispatcherHeartbeat, WebSession
 
 FORMAT = 1

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.storage.errors import StorageError
 from service.storage.garbage import delete_orphans
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
+from service.storage.storage_errors import StorageError
 from service.upkeep.retention import (
     delete_expired_actions,
     delete_expired_jobs,

@@ -16,10 +16,10 @@ from service.core.errors import Conflict
 from service.core.states import OPEN_STATES
 from service.items.deletion import HasDependents, delete_item
 from service.storage.columns import utc_now
-from service.storage.errors import RowNotFound
 from service.storage.garbage import MINIMUM_AGE
 from service.storage.sessions import Database, SessionOwner, find_project
 from service.storage.statements import split_chunks
+from service.storage.storage_errors import RowNotFound
 from service.storage.tables import (
     AuditEntry,
     Checkpoint,

@@ -12,7 +12,7 @@ from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.core.units import is_blank_unit
 from sysid.data.records import Hold
-from sysid.kernels.reads import is_difference
+from sysid.kernels.signals.past_reads import is_difference
 from sysid.language.delays import has_varying_delay
 from sysid.language.evaluation import evaluate_expression
 from sysid.language.printer import format_expression

@@ -12,12 +12,12 @@ from sysid.control.control_law import build_control_law
 from sysid.control.controllers import PidControl, Transport
 from sysid.core.errors import InvalidSettings, suggest_name
 from sysid.language.delays import collect_past_values, has_varying_delay
-from sysid.language.intervals import bound_expression
 from sysid.language.printer import format_expression
 from sysid.language.transform import add_delays, shift_expression, substitute
 from sysid.language.tree import Binary, Expression, Number, PastValue, Symbol
-from sysid.models.delays import list_past_values
+from sysid.language.value_intervals import bound_expression
 from sysid.models.model import DerivedInitial, EstimatedInitial, FixedInitial, InitialState, Model
+from sysid.models.model_delays import list_past_values
 from sysid.models.parameters import Parameter
 from sysid.models.sections import get_interval
 from sysid.models.ties import resolve_ties

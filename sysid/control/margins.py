@@ -15,7 +15,7 @@ from sysid.control.transfer import (
     group_by_delay,
 )
 from sysid.core.types import BoolArray, ComplexArray, FloatArray
-from sysid.kernels.reads import is_difference
+from sysid.kernels.signals.past_reads import is_difference
 
 _OUTER_DECADES = 3  # below the slowest and above the fastest part of the loop
 _MAX_FREQUENCY_RATIO = 1e8  # of a corner frequency to the middle one; others are limited to it

@@ -4,7 +4,7 @@ import numpy as np
 
 from sysid.control.linear_form import AffineForm, IdentifiedModel, NotLinear, to_linear_form
 from sysid.core.types import FloatArray
-from sysid.models.catalogue.processes import Process
+from sysid.models.catalogue.process_family import Process
 
 _NEGLIGIBLE = 1e-9  # of the largest: rounding
 

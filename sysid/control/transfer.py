@@ -18,7 +18,7 @@ from sysid.control.linear_form import (
     to_linear_form,
 )
 from sysid.data.interpolation import MAX_POINTS_PER_STEP, POINTS_PER_SAMPLE
-from sysid.kernels.reads import find_averaged_inputs, is_difference
+from sysid.kernels.signals.past_reads import find_averaged_inputs, is_difference
 
 QuasiPolynomial: TypeAlias = Mapping[tuple[int, float], float]
 """(p, d): coefficient."""

@@ -22,7 +22,7 @@ from sysid.control.transfer import (
 )
 from sysid.core.errors import InvalidSettings
 from sysid.core.types import ComplexArray
-from sysid.kernels.reads import is_difference
+from sysid.kernels.signals.past_reads import is_difference
 
 TuningRule = Literal["simc", "amigo"]
 ControllerKind = Literal["PI", "PID"]

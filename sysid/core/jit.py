@@ -35,7 +35,7 @@ from sysid.core.code_cache import digest_files, load_code, store_code, warn_not_
 _SOURCE_PATTERNS = (
     "search/*.py",
     "islands/*.py",
-    "kernels/*.py",
+    "kernels/**/*.py",
     "simulation/*.py",
     "uncertainty/local_algebra.py",
     "uncertainty/sensitivities.py",

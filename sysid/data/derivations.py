@@ -19,7 +19,7 @@ from sysid.core.units import (
     is_readable_unit,
     suggest_unit,
 )
-from sysid.data.arguments import StepArguments
+from sysid.data.derivation_arguments import StepArguments
 from sysid.data.history import attach_history, change_values, drop_history
 from sysid.data.noise import NOISE_KINDS, Noise, draw_noise
 from sysid.data.pooling import pool_segments, select_segments

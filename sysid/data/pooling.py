@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.core.errors import suggest_name
 from sysid.core.types import FloatArray, IntArray
-from sysid.data.arguments import StepArguments
+from sysid.data.derivation_arguments import StepArguments
 from sysid.data.records import Channel, Recording, Segment
 
 SegmentLabel = float | str

@@ -11,12 +11,7 @@ from numpy.typing import ArrayLike
 from sysid.core.errors import InvalidRecord, suggest_name
 from sysid.core.text import append_unit
 from sysid.core.types import FloatArray
-from sysid.data.holds import HOLDS as HOLDS
-from sysid.data.holds import Hold as Hold
-from sysid.data.holds import HoldChoice, choose_hold
-from sysid.data.holds import HoldSetting as HoldSetting
-from sysid.data.table_rules import TimeAxis, tell_notes
-from sysid.data.tables import (
+from sysid.data.foreign_tables import (
     Column,
     Labelled,
     describe_object,
@@ -29,6 +24,11 @@ from sysid.data.tables import (
     split_series,
     to_frame,
 )
+from sysid.data.holds import HOLDS as HOLDS
+from sysid.data.holds import Hold as Hold
+from sysid.data.holds import HoldChoice, choose_hold
+from sysid.data.holds import HoldSetting as HoldSetting
+from sysid.data.table_rules import TimeAxis, tell_notes
 from sysid.data.value_checks import describe_missing_values, find_infinite_value
 
 REGULARITY_TOLERANCE = 1e-2

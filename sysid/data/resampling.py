@@ -7,7 +7,7 @@ from math import floor
 import numpy as np
 
 from sysid.core.types import FloatArray
-from sysid.data.arguments import StepArguments
+from sysid.data.derivation_arguments import StepArguments
 from sysid.data.history import INTERPOLATION_MARGIN
 from sysid.data.interpolation import average_held
 from sysid.data.records import Channel, History, Recording, Segment

@@ -22,7 +22,7 @@ from sysid.core.errors import InvalidModel
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import RANK_TOLERANCE, FloatArray, IntArray
 from sysid.core.units import format_unit
-from sysid.kernels.reads import is_difference
+from sysid.kernels.signals.past_reads import is_difference
 from sysid.models.model import (
     EstimatedInitial,
     FixedInitial,
@@ -34,7 +34,7 @@ from sysid.models.model import (
 from sysid.models.parse import parse_model
 from sysid.models.sections import STEADY
 from sysid.search.refine import refine_candidates
-from sysid.simulation.metrics import compute_mean
+from sysid.simulation.fit_metrics import compute_mean
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate

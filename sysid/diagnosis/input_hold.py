@@ -16,7 +16,7 @@ from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 from sysid.data.records import Channel, Record
-from sysid.kernels.reads import is_difference
+from sysid.kernels.signals.past_reads import is_difference
 from sysid.residuals.feedback import find_commands
 from sysid.residuals.residual_tests import list_residual_series
 from sysid.results.parts import InputHold

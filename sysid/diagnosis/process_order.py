@@ -3,7 +3,7 @@
 A dead time absorbs a missing time constant: L comes out too long, with a small standard error, and
 residuals that pass their tests. Only the fit of another order shows it. So a model that is a
 process with dead time, however it is written (`sysid.control.process_form`), is compared with its
-neighbours in the catalogue (`sysid.models.catalogue.processes`).
+neighbours in the catalogue (`sysid.models.catalogue.process_family`).
 
 All orders are fitted to the same samples under the same assumptions, also the model's own: the
 entry of the catalogue, with free initial states and one integration step. Least squares starts from
@@ -31,7 +31,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Record
 from sysid.diagnosis.warnings import find_delay_parameters
 from sysid.models.catalogue.load import load_model
-from sysid.models.catalogue.processes import Process, ProcessEntry, list_neighbouring_orders
+from sysid.models.catalogue.process_family import Process, ProcessEntry, list_neighbouring_orders
 from sysid.models.model import name_initial_state, replace_substeps
 from sysid.noise_models.generalised_least_squares import WhitenedLeastSquares
 from sysid.residuals.series import is_coloured, iterate_parts, make_whitening

@@ -25,11 +25,11 @@ from sysid.core.errors import InvalidRecord
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 from sysid.data.records import Channel, Record
-from sysid.kernels.reads import list_delayed_values
+from sysid.kernels.signals.past_reads import list_delayed_values
 from sysid.language.functions import Interval
 from sysid.minima.minima import Fit, collect_minima, scan_parameters
-from sysid.models.delays import compute_longest_delay, list_past_values
 from sysid.models.model import EstimatedInitial
+from sysid.models.model_delays import compute_longest_delay, list_past_values
 from sysid.results.parts import Minimum
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.simulation.problem import Problem

@@ -12,7 +12,7 @@ from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.residuals.residual_tests import ResidualTests, run_residual_tests
 from sysid.search.refine import refine_candidates
-from sysid.simulation.metrics import Metrics
+from sysid.simulation.fit_metrics import Metrics
 from sysid.simulation.problem import Problem, compute_metrics
 from sysid.uncertainty.estimates import Estimate
 

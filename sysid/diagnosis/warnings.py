@@ -9,9 +9,9 @@ from sysid.core.units import format_unit
 from sysid.diagnosis.suspects import DYNAMICS, describe_suspects, find_suspects
 from sysid.diagnosis.unrecorded_input import warn_unrecorded_input
 from sysid.identifiability.combinations import IdentifiableCombination
-from sysid.kernels.reads import list_delayed_values
+from sysid.kernels.signals.past_reads import list_delayed_values
 from sysid.models.ties import collect_parameter_names
-from sysid.models.units import (
+from sysid.models.unit_checks import (
     list_mixed_unit_warnings,
     list_time_unit_warnings,
     list_unread_unit_warnings,
@@ -21,7 +21,7 @@ from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.residual_tests import ResidualTests
 from sysid.residuals.sandwich import MIN_REPEATS, count_repeats
 from sysid.search.island import get_island_settings
-from sysid.simulation.metrics import ChannelMetrics, Metrics
+from sysid.simulation.fit_metrics import ChannelMetrics, Metrics
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.estimates import Estimate, NoiseColour, Uncertainty

@@ -14,7 +14,7 @@ from typing import Literal
 from sysid.control.linear_form import IdentifiedModel
 from sysid.core.errors import InvalidSettings
 from sysid.data.interpolation import MAX_POINTS_PER_STEP, POINTS_PER_SAMPLE
-from sysid.export.expressions import (
+from sysid.export.expression_text import (
     HELPER_ARGUMENTS,
     ExportScope,
     TargetLanguage,
@@ -22,7 +22,7 @@ from sysid.export.expressions import (
     write_number,
 )
 from sysid.export.identifiers import Identifiers
-from sysid.kernels.reads import (
+from sysid.kernels.signals.past_reads import (
     find_averaged_inputs,
     is_difference,
     list_stored_histories,

@@ -8,7 +8,7 @@ from typing import ClassVar
 from sysid.control.linear_form import IdentifiedModel
 from sysid.data.interpolation import MAX_POINTS_PER_STEP
 from sysid.export.description import describe_model, describe_unit, describe_values, wrap_source
-from sysid.export.expressions import TargetLanguage, write_expression, write_number
+from sysid.export.expression_text import TargetLanguage, write_expression, write_number
 from sysid.export.identifiers import Identifiers, escape_docstring
 from sysid.export.program import (
     GeneratedProgram,

@@ -9,7 +9,7 @@ from sysid.control.transfer import (
     group_by_delay,
 )
 from sysid.export.description import describe_model, wrap_source
-from sysid.export.expressions import write_number
+from sysid.export.expression_text import write_number
 from sysid.export.identifiers import escape_docstring
 
 _LINE_WIDTH = 96

@@ -18,7 +18,7 @@ from sysid.core.text import (
 )
 from sysid.figures import theme
 from sysid.figures.data import Floats, SearchTraces
-from sysid.figures.grid import PlotArea, PlotGrid, add_axes, add_caption
+from sysid.figures.figure_grid import PlotArea, PlotGrid, add_axes, add_caption
 from sysid.figures.theme import stride_indices
 from sysid.models.parameters import Parameter
 from sysid.search.state import Improvement, IslandSummary

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator, Mapping
 from math import inf
 
 from sysid.language.functions import Interval
-from sysid.language.intervals import bound_expression
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, walk
-from sysid.models.delays import compute_longest_delay, has_known_past, list_past_values
+from sysid.language.value_intervals import bound_expression
+from sysid.models.model_delays import compute_longest_delay, has_known_past, list_past_values
 from sysid.models.parameters import Parameter
 from sysid.models.sections import get_interval
 from sysid.models.ties import collect_parameter_names

@@ -20,9 +20,9 @@ from itertools import chain, combinations
 import numpy as np
 
 from sysid.core.types import FloatArray
-from sysid.identifiability.scaling import find_scalings
+from sysid.identifiability.scaling_symmetries import find_scalings
 from sysid.identifiability.subsystems import ExchangeUnit, find_equivalent_subsystems
-from sysid.models.delays import list_past_values
+from sysid.models.model_delays import list_past_values
 from sysid.models.ties import collect_parameter_names
 from sysid.simulation.problem import Problem
 

@@ -31,7 +31,7 @@ from sysid.identifiability.exchange import (
 )
 from sysid.identification.budget import Budget
 from sysid.identification.deadline import Deadline
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.islands.stopping import count_restarts
 from sysid.minima.local_minima import (
     LocalMinima,

@@ -48,7 +48,7 @@ from sysid.identifiability.exchange import describe_exchanges
 from sysid.identification.best_estimate import IslandEnd, find_best_estimate, is_refining
 from sysid.identification.budget import Budget
 from sysid.identification.deadline import Clock, Deadline
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.minima.minima import mark_ambiguous
 from sysid.minima.search_evidence import assess_search, mark_unsettled, warn_unsettled
 from sysid.noise_models.noise_model_choice import resolve_noise_model

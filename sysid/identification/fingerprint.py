@@ -6,7 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from sysid.core.code_cache import digest_files
-from sysid.kernels.machine_code import describe_machine
+from sysid.kernels.compilation.machine_code import describe_machine
 
 _LIBRARIES = ("numpy", "scipy", "numba", "emcee")
 

@@ -8,7 +8,10 @@ from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss
 from sysid.core.text import rewrite_settings
 from sysid.data.records import Record
 from sysid.diagnosis.warnings import warn_constant_outputs
-from sysid.identification.arguments import (
+from sysid.identification.conclude import conclude_run
+from sysid.identification.fit_problems import build_problems, prepare_records
+from sysid.identification.fitted_data import collect_fitted_data
+from sysid.identification.identify_arguments import (
     Data,
     ReadRecords,
     check_warm,
@@ -16,17 +19,14 @@ from sysid.identification.arguments import (
     read_records,
     write_setting,
 )
-from sysid.identification.conclude import conclude_run
-from sysid.identification.fit_problems import build_problems, prepare_records
-from sysid.identification.fitted_data import collect_fitted_data
 from sysid.identification.options import RunOptions
 from sysid.identification.request import IdentificationRequest, accept_fields
 from sysid.identification.run import advance_run, begin_run, is_finished
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.models.catalogue.load import resolve_model
-from sysid.models.delays import check_unused_settings
 from sysid.models.model import Model
-from sysid.models.units import check_signal_units
+from sysid.models.model_delays import check_unused_settings
+from sysid.models.unit_checks import check_signal_units
 from sysid.results.identification import Identification
 
 _PROGRESS_SECONDS = 0.25

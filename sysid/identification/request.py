@@ -11,13 +11,13 @@ from typing import Any, ParamSpec, TypeVar, get_type_hints
 
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, PredictionKind, Weights
+from sysid.data.foreign_tables import describe_value
 from sysid.data.holds import HoldSetting
 from sysid.data.noise import Noise
 from sysid.data.records import Channel
-from sysid.data.tables import describe_value
-from sysid.identification.arguments import Change, Data
+from sysid.identification.identify_arguments import Change, Data
 from sysid.identification.options import RunOptions
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.models.catalogue.load import ModelSource
 
 Arguments = ParamSpec("Arguments")

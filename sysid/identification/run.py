@@ -19,7 +19,7 @@ from sysid.islands.evolve import (
     make_search_plan,
 )
 from sysid.islands.migration import migrate
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.islands.stopping import has_search_ended, make_stopping_rule
 from sysid.search.island import Island, evolve, get_island_settings
 from sysid.selection.starts import find_equation_error_starts

@@ -6,7 +6,7 @@ A kernel is one C function of addresses and whole numbers::
                 double *predictions, i64 predictions_stride, double *loss)
 
 theta : K rows of `stride`: row = parameter, column = individual; P is a multiple of `NARROW_LANES`.
-ints, floats : one experiment as packed by `sysid.simulation.packing`.
+ints, floats : one experiment as packed by `sysid.simulation.experiment_arrays`.
 work : scratch memory of the experiment's size; its initial contents do not matter.
 predictions : null, or M_e rows of `predictions_stride`: simulated value at each measured time.
 loss : P sums; the kernel *adds* the experiment's loss, Σ w²e² for squares or

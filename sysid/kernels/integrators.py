@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from typing import Protocol
 
-from sysid.kernels import reads
-from sysid.kernels.delayed_reads import TimeStep
-from sysid.kernels.expressions import Environment, emit_expression
-from sysid.kernels.signal_readers import SignalReaders
-from sysid.kernels.signals import HistoryEnvironment, ParameterEnvironment, States
+from sysid.kernels.expression_code import Environment, emit_expression
+from sysid.kernels.signals import past_reads
+from sysid.kernels.signals.block_signals import HistoryEnvironment, ParameterEnvironment, States
+from sysid.kernels.signals.delayed_reads import TimeStep
+from sysid.kernels.signals.signal_readers import SignalReaders
 from sysid.kernels.vectors import DOUBLE, IrValue, VectorBuilder
 from sysid.language.delays import has_varying_delay
 from sysid.language.tree import Expression, PastValue, Symbol
@@ -52,7 +52,7 @@ class StepEnvironment(Environment):
         number = self.states.names.index(past.name)
         position = self.half_steps
         if self.is_in_equation:
-            position = reads.find_state_position(self.model, position, self.equation, number)
+            position = past_reads.find_state_position(self.model, position, self.equation, number)
         halves = position - 2 * past.offset
         if past.delay is None:
             return self._emit_sample(past.name, -halves // 2)
@@ -84,7 +84,7 @@ class StepEnvironment(Environment):
         return self.equation >= 0
 
     def _emit_sample(self, name: str, back: int) -> IrValue:
-        if back > reads.MAX_REGISTER_OFFSET:
+        if back > past_reads.MAX_REGISTER_OFFSET:
             return self.states.load_far_sample(name, back, self.time_step.row)
         return self.states.now[name] if back == 0 else self.states.line[name][back]
 
@@ -115,7 +115,7 @@ def emit_next_states(
     build_environment: EnvironmentBuilder,
 ) -> dict[str, IrValue]:
     """Emit the states one step later."""
-    if reads.is_difference(model):
+    if past_reads.is_difference(model):
         return _emit_recursion(lanes, model, build_environment)
     if model.solver.method == "rk4":
         return _emit_runge_kutta(lanes, model, step, states, build_environment)

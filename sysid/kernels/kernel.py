@@ -4,21 +4,21 @@ from dataclasses import dataclass
 
 from llvmlite import ir
 
-from sysid.kernels import reads
 from sysid.kernels.abi import KERNEL_ARGUMENTS, KERNEL_NAME, LANES, NARROW_LANES, build_kernel_type
-from sysid.kernels.delayed_reads import TimeStep
-from sysid.kernels.expressions import emit_expression
+from sysid.kernels.expression_code import emit_expression
 from sysid.kernels.integrators import EnvironmentBuilder, StepEnvironment, emit_next_states
 from sysid.kernels.layout import ExperimentLayout, KernelVariant
-from sysid.kernels.loss import LossAccumulator
-from sysid.kernels.signal_readers import SignalReaders
-from sysid.kernels.signals import (
+from sysid.kernels.loss_code import LossAccumulator
+from sysid.kernels.signals import past_reads
+from sysid.kernels.signals.block_signals import (
     Delays,
     ExperimentHead,
     ParameterEnvironment,
     StartEnvironment,
     States,
 )
+from sysid.kernels.signals.delayed_reads import TimeStep
+from sysid.kernels.signals.signal_readers import SignalReaders
 from sysid.kernels.vectors import IrValue, KernelLoop, VectorBuilder
 from sysid.language.tree import Binary, FunctionCall, walk
 from sysid.models.model import DerivedInitial, EstimatedInitial, MeasuredInitial, Model
@@ -175,7 +175,7 @@ class _Block:
     ) -> dict[str, IrValue]:
         """Emit the next states: computed, or in the first samples of a recursion measured."""
         lanes, model = self.lanes, self.model
-        if not reads.is_difference(model) or model.memory <= 1:
+        if not past_reads.is_difference(model) or model.memory <= 1:
             return emit_next_states(
                 lanes, model, self.experiment.get_number("step"), states, build_environment
             )

@@ -26,7 +26,7 @@ from sysid.language.parser import (
 )
 from sysid.language.printer import format_number
 from sysid.language.scope import Scope
-from sysid.language.tables import MAX_POINTS, TABLE_FUNCTIONS
+from sysid.language.table_functions import MAX_POINTS, TABLE_FUNCTIONS
 from sysid.language.transform import shift_expression
 from sysid.language.tree import (
     Binary,

@@ -3,7 +3,6 @@
 from math import floor, isinf
 from typing import NamedTuple
 
-from sysid.language.intervals import bound_expression
 from sysid.language.monomials import (
     CONSTANT,
     LaurentPolynomial,
@@ -16,6 +15,7 @@ from sysid.language.monomials import (
 from sysid.language.printer import format_expression, format_number
 from sysid.language.scope import Scope
 from sysid.language.tree import Expression, PastValue, Symbol, walk
+from sysid.language.value_intervals import bound_expression
 
 _PERIOD = Symbol("h", "period")
 _MAX_DELAY = 1e6

@@ -11,7 +11,7 @@ import numpy as np
 
 from sysid.core.types import FloatArray
 from sysid.language.functions import FUNCTIONS, OPERATORS
-from sysid.language.tables import TABLE_FUNCTIONS, evaluate_table
+from sysid.language.table_functions import TABLE_FUNCTIONS, evaluate_table
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, Symbol, Unary
 
 

@@ -1,7 +1,7 @@
 """Operators and functions of the language, in one table for all layers.
 
 To add a function, add its entry here. If LLVM has no intrinsic for it, write its instructions in
-`sysid.kernels.expressions`, or name it in `sysid.kernels.vectors.LIBRARY_FUNCTIONS`. If C99 or
+`sysid.kernels.expression_code`, or name it in `sysid.kernels.vectors.LIBRARY_FUNCTIONS`. If C99 or
 NumPy has no function for it, write one in `sysid.export`.
 """
 

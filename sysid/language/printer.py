@@ -2,7 +2,7 @@
 
 from sysid.language.functions import OPERATORS, Level
 from sysid.language.monomials import CONSTANT, add_polynomials, collect_terms, to_expression
-from sysid.language.tables import TABLE_FUNCTIONS
+from sysid.language.table_functions import TABLE_FUNCTIONS
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 
 

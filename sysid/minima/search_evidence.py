@@ -9,7 +9,7 @@ well.
 from dataclasses import replace
 from typing import Literal
 
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.islands.stopping import count_restarts
 from sysid.minima.minima import FoundMinima
 from sysid.residuals.residual_tests import ResidualTests

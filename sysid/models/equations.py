@@ -7,10 +7,10 @@ from typing import NamedTuple
 from sysid.core.errors import join_pointer, suggest_name
 from sysid.language.checker import MAX_NODES, CheckedExpression, check_expression
 from sysid.language.delays import collect_past_values
-from sysid.language.intervals import bound_expression
 from sysid.language.scope import Scope
 from sysid.language.tree import Expression, Number, PastValue, walk
-from sysid.models.documents import DocumentReader
+from sysid.language.value_intervals import bound_expression
+from sysid.models.document_reader import DocumentReader
 from sysid.models.model import ModelSignal, Output
 from sysid.models.sections import MAX_EQUATIONS
 

@@ -16,7 +16,7 @@ from sysid.language.printer import format_expression
 from sysid.language.scope import Scope
 from sysid.language.transform import substitute
 from sysid.language.tree import Expression, Number, PastValue, Symbol, walk
-from sysid.models.documents import DocumentReader
+from sysid.models.document_reader import DocumentReader
 from sysid.models.equations import add_faults
 from sysid.models.model import DerivedInitial, FixedInitial, HistoryFunction, InitialState
 from sysid.models.sections import HISTORY, MAX_EQUATIONS, STEADY

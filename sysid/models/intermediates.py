@@ -12,7 +12,7 @@ from sysid.language.checker import check_expression
 from sysid.language.parser import tokenize_expression
 from sysid.language.scope import Scope
 from sysid.language.tree import Expression, Number
-from sysid.models.documents import DocumentReader
+from sysid.models.document_reader import DocumentReader
 from sysid.models.equations import add_faults
 
 MAX_INTERMEDIATES = 256

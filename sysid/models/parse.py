@@ -9,7 +9,7 @@ from sysid.core.errors import Fault, InvalidModel, InvalidSettings, join_pointer
 from sysid.language.scope import EquationForm, Scope
 from sysid.language.tree import Expression, Number, PastValue, match_plain_state
 from sysid.models import equations
-from sysid.models.documents import DocumentReader, quote_value
+from sysid.models.document_reader import DocumentReader, quote_value
 from sysid.models.histories import derive_starts, read_histories
 from sysid.models.intermediates import read_intermediates
 from sysid.models.model import (
@@ -39,7 +39,7 @@ from sysid.models.sections import (
     read_solver,
 )
 from sysid.models.ties import resolve_ties
-from sysid.models.units import check_delay_units
+from sysid.models.unit_checks import check_delay_units
 
 _COMMON_FIELDS = (
     "name",

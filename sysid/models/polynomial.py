@@ -17,7 +17,7 @@ from sysid.language.delays import has_varying_delay, split_index
 from sysid.language.printer import format_expression
 from sysid.language.scope import Scope
 from sysid.language.tree import Binary, Expression, Number, PastValue, Symbol
-from sysid.models.documents import DocumentReader, quote_value
+from sysid.models.document_reader import DocumentReader, quote_value
 from sysid.models.equations import add_faults
 from sysid.models.model import Criterion, ErrorKind, Term, TermRule
 from sysid.models.parameters import Parameter, ParameterScale

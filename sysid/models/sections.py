@@ -10,7 +10,7 @@ from sysid.language.checker import SignalUse, check_expression
 from sysid.language.scope import EquationForm, Scope, list_reserved_names
 from sysid.language.transform import substitute
 from sysid.language.tree import Expression, Number, PastValue, Symbol, walk
-from sysid.models.documents import DocumentReader, quote_value
+from sysid.models.document_reader import DocumentReader, quote_value
 from sysid.models.model import (
     MAX_SUBSTEPS,
     DerivedInitial,

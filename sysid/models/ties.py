@@ -15,7 +15,7 @@ from sysid.language.delays import mentions_time
 from sysid.language.scope import EquationForm, Scope
 from sysid.language.transform import substitute
 from sysid.language.tree import Expression, Symbol, walk
-from sysid.models.documents import DocumentReader
+from sysid.models.document_reader import DocumentReader
 from sysid.models.intermediates import read_intermediates
 from sysid.models.model import DerivedInitial, Model
 from sysid.models.parameters import Parameter

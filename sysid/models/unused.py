@@ -5,8 +5,8 @@ from collections.abc import Iterator, Mapping
 from sysid.core.errors import Fault, join_pointer
 from sysid.language.parser import tokenize_expression
 from sysid.language.tree import PastValue, walk
-from sysid.models.delays import find_unused_settings, list_past_values, list_trees
 from sysid.models.model import Model
+from sysid.models.model_delays import find_unused_settings, list_past_values, list_trees
 from sysid.models.ties import apply_ties, resolve_ties
 
 _READING_FIELDS = ("equations", "outputs", "initial", "history", "lags", "terms")

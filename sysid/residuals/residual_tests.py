@@ -45,8 +45,8 @@ from sysid.residuals.autocorrelation import (
 )
 from sysid.residuals.past_outputs import count_past_output_coefficients
 from sysid.residuals.whitening import Whitening, compute_ar1_coefficient
+from sysid.simulation.fit_metrics import compute_mean
 from sysid.simulation.loss import compute_influence
-from sysid.simulation.metrics import compute_mean
 
 if TYPE_CHECKING:  # the web pages read these results without a compiler
     from sysid.simulation.problem import Problem

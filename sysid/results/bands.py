@@ -13,7 +13,7 @@ from sysid.data.records import Channels, Record, Recording
 from sysid.models.model import Model, name_initial_state, replace_substeps
 from sysid.models.parse import keep_terms
 from sysid.results.result import FullResult
-from sysid.simulation.metrics import ChannelMetrics
+from sysid.simulation.fit_metrics import ChannelMetrics
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import prepare_simulation
 from sysid.uncertainty.estimates import Estimate

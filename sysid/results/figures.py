@@ -31,9 +31,9 @@ from sysid.figures.data import (
     SignalTrace,
 )
 from sysid.figures.plotly import Abscissa, Figure, apply_theme, empty_figure, has_points
-from sysid.figures.posterior import plot_posterior
-from sysid.figures.residuals import plot_residuals
-from sysid.figures.signals import plot_response
+from sysid.figures.posterior_figures import plot_posterior
+from sysid.figures.residual_figures import plot_residuals
+from sysid.figures.signal_figures import plot_response
 from sysid.figures.stack import stack_figures
 from sysid.figures.theme import Theme
 from sysid.models.parameters import Parameter, ParameterScale

@@ -21,7 +21,7 @@ from sysid.residuals.residual_tests import CorrelationFunction, ResidualTests
 from sysid.results.parts import InputHold, OrderComparison, SearchEvidence
 from sysid.results.verdict import Verdict
 from sysid.search.state import Improvement, IslandSummary, Migrant
-from sysid.simulation.metrics import ChannelMetrics
+from sysid.simulation.fit_metrics import ChannelMetrics
 from sysid.uncertainty.estimates import (
     CorrelationMatrix,
     Criteria,

@@ -14,7 +14,7 @@ from sysid.core.text import plain_estimate, plain_unit
 if TYPE_CHECKING:  # the client's types name `Trust`, and load no numerics
     from sysid.residuals.residual_tests import ResidualTest
     from sysid.results.parts import OrderComparison, SearchEvidence
-    from sysid.simulation.metrics import ChannelMetrics
+    from sysid.simulation.fit_metrics import ChannelMetrics
     from sysid.uncertainty.estimates import Estimate
 
 Trust = Literal["trustworthy", "limited", "not trustworthy"]

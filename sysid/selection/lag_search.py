@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.language.intervals import bound_expression
+from sysid.language.value_intervals import bound_expression
 from sysid.models.model import Model
 from sysid.models.parameters import Parameter
 from sysid.models.sections import get_interval

@@ -15,8 +15,8 @@ import numpy as np
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.interpolation import FineInput
 from sysid.data.records import Record
-from sysid.language.intervals import bound_expression
 from sysid.language.tree import PastValue
+from sysid.language.value_intervals import bound_expression
 from sysid.models.model import Model, Term, build_initial_parameters
 from sysid.models.parameters import Parameter
 from sysid.models.sections import get_interval

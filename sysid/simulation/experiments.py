@@ -12,7 +12,7 @@ from sysid.core.settings import FitSettings
 from sysid.core.types import BoolArray, FloatArray
 from sysid.data.interpolation import FineInput
 from sysid.data.records import Channel, Record
-from sysid.kernels.reads import is_difference
+from sysid.kernels.signals.past_reads import is_difference
 from sysid.language.tree import PastValue, match_plain_state
 from sysid.models.model import (
     DerivedInitial,
@@ -23,13 +23,13 @@ from sysid.models.model import (
     name_initial_state,
 )
 from sysid.models.parameters import Parameter
-from sysid.simulation.grid import Grid, locate_samples, make_grid
-from sysid.simulation.packing import (
+from sysid.simulation.experiment_arrays import (
     OutputSamples,
     StateStart,
     find_largest_delays,
     interpolate_inputs,
 )
+from sysid.simulation.grid import Grid, locate_samples, make_grid
 
 # Weights outside this range are mistakes. Squares of weighted residuals could overflow.
 _MIN_WEIGHT, _MAX_WEIGHT = 1e-100, 1e100

@@ -10,7 +10,7 @@ from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.core.types import FloatArray
 from sysid.data.interpolation import estimate_sampling_period
 from sysid.data.records import Channel
-from sysid.kernels.reads import is_difference
+from sysid.kernels.signals.past_reads import is_difference
 from sysid.models.model import Model
 
 MAX_STEPS = 20_000_000

@@ -12,15 +12,23 @@ from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.core.settings import FitSettings, Loss, PredictionKind, Weights
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import Record
-from sysid.kernels.build import get_kernel_address
+from sysid.kernels.compilation.build import get_kernel_address
 from sysid.kernels.layout import KernelVariant
-from sysid.kernels.reads import list_delaying_inputs
-from sysid.models.delays import check_delays
+from sysid.kernels.signals.past_reads import list_delaying_inputs
 from sysid.models.model import Model, build_initial_parameters
+from sysid.models.model_delays import check_delays
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.ties import Ties, apply_ties, resolve_ties
 from sysid.simulation.data_bounds import add_units_of_data, bound_by_data
 from sysid.simulation.evaluator import Evaluator, evaluate_population, predict_population
+from sysid.simulation.experiment_arrays import (
+    PackedExperiment,
+    are_on_grid,
+    find_range,
+    has_weights,
+    pack_experiment,
+    replace_measured,
+)
 from sysid.simulation.experiments import (
     GridExperiment,
     compute_output_weights,
@@ -28,21 +36,13 @@ from sysid.simulation.experiments import (
     replace_outputs,
     split_weights,
 )
-from sysid.simulation.metrics import (
+from sysid.simulation.fit_metrics import (
     ChannelMetrics,
     Metrics,
     compute_fit_percent,
     compute_line_rms,
     compute_mean,
     rms,
-)
-from sysid.simulation.packing import (
-    PackedExperiment,
-    are_on_grid,
-    find_range,
-    has_weights,
-    pack_experiment,
-    replace_measured,
 )
 
 _Value = TypeVar("_Value")

@@ -13,12 +13,13 @@ from numpy.typing import ArrayLike
 
 from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
 from sysid.core.types import FloatArray
+from sysid.data.foreign_tables import describe_object, measure_distance, read_times
 from sysid.data.holds import Hold
 from sysid.data.records import Channel, Channels, Record, Recording, to_channels
 from sysid.data.table_rules import TimeAxis, split_headings
-from sysid.data.tables import describe_object, measure_distance, read_times
 from sysid.language.evaluation import evaluate_expression as value_of
 from sysid.models.catalogue.load import ModelSource, resolve_model
+from sysid.models.channel_assignment import name_inputs
 from sysid.models.model import (
     DerivedInitial,
     FixedInitial,
@@ -30,7 +31,6 @@ from sysid.models.model import (
 )
 from sysid.models.parameters import Parameter
 from sysid.models.parse import keep_terms
-from sysid.models.signals import name_inputs
 from sysid.models.ties import resolve_ties
 from sysid.simulation.problem import build_simulation_problem
 

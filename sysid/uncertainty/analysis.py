@@ -18,8 +18,8 @@ change. The position on a plateau is undetermined. So w²/12 is added to the var
 interval is centred on the plateau.
 
 Directions that no data identify follow from the form of the equations
-(`sysid.identifiability.scaling`); they are removed from S exactly. Directions that these data do
-not identify follow from the singular values of S. Both give groups
+(`sysid.identifiability.scaling_symmetries`); they are removed from S exactly. Directions that these
+data do not identify follow from the singular values of S. Both give groups
 (`sysid.identifiability.combinations`).
 """
 
@@ -39,7 +39,7 @@ from sysid.identifiability.combinations import (
     find_unidentified,
 )
 from sysid.identifiability.exchange import ExchangeGroups
-from sysid.identifiability.scaling import find_scalings
+from sysid.identifiability.scaling_symmetries import find_scalings
 from sysid.identifiability.translations import find_translations
 from sysid.residuals.sandwich import Sandwich, estimate_sandwich
 from sysid.residuals.series import iterate_parts

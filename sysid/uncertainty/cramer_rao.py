@@ -19,7 +19,7 @@ from sysid.core.errors import InvalidSettings
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray
 from sysid.identifiability.combinations import NULL_SHARE
-from sysid.identifiability.scaling import find_scalings
+from sysid.identifiability.scaling_symmetries import find_scalings
 from sysid.identifiability.translations import find_translations
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import compute_physical_scale, remove_symmetries

@@ -27,7 +27,7 @@ from sysid.residuals.series import (
     iterate_parts,
 )
 from sysid.search.refine import refine_candidates
-from sysid.simulation.metrics import ChannelMetrics
+from sysid.simulation.fit_metrics import ChannelMetrics
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.sensitivities import BudgetSpentError, compute_sensitivities
 

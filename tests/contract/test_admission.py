@@ -4,7 +4,7 @@ from service.core.states import JobState
 from service.queue.admission import Admission, UnfinishedWork, count_unfinished
 from service.queue.leases import LeaseQueue
 from service.queue.notifications import read_queue_status
-from service.repositories.jobs import JobRepository
+from service.repositories.job_rows import JobRepository
 from service.storage.tables import Project
 from tests.support.storage.job_rows import claim, new_job, submit
 

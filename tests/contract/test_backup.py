@@ -14,15 +14,15 @@ from service.access.keys import create_key
 from service.core.states import JobState
 from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
 from service.queue.leases import LeaseQueue
-from service.repositories.history import HistoryPoint, pack_history
-from service.repositories.jobs import JobRepository
-from service.repositories.references import ReferenceRepository
+from service.repositories.history_rows import HistoryPoint, pack_history
+from service.repositories.job_rows import JobRepository
+from service.repositories.reference_rows import ReferenceRepository
 from service.storage import migrate
 from service.storage.columns import utc_now
-from service.storage.errors import LeaseLost
 from service.storage.objects import ObjectStore, open_store
 from service.storage.sessions import Database
 from service.storage.statements import insert_missing
+from service.storage.storage_errors import LeaseLost
 from service.storage.tables import (
     DEFAULT_PROJECT,
     ApiKey,

@@ -7,9 +7,9 @@ import pytest
 from service.core.states import JobState
 from service.queue.leases import LeaseOwners, LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories.events import EventRepository
-from service.repositories.jobs import JobRepository
-from service.storage.errors import RowConflict, RowNotFound
+from service.repositories.event_rows import EventRepository
+from service.repositories.job_rows import JobRepository
+from service.storage.storage_errors import RowConflict, RowNotFound
 from tests.support.storage.job_rows import (
     claim,
     job_of,

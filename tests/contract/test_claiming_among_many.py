@@ -9,11 +9,11 @@ from sqlalchemy import Connection, Engine, event, insert, text
 
 from service.api.event_feed import EventFeed
 from service.core.states import OPEN_STATES, JobState
-from service.jobs.schemas import JobIn
+from service.jobs.job_schemas import JobIn
 from service.queue.admission import Admission
 from service.queue.leases import JobProgress, LeaseOwners, LeaseQueue
 from service.queue.notifications import read_queue_status
-from service.repositories.jobs import JobRepository
+from service.repositories.job_rows import JobRepository
 from service.storage.columns import utc_now
 from service.storage.tables import Job, Parcel, Project
 from tests.support.storage.job_rows import submit_and_claim

@@ -6,7 +6,7 @@ import pytest
 
 from service.core.errors import InvalidRequest
 from service.runs.comparison import compare_runs
-from service.runs.schemas import ComparisonOut
+from service.runs.run_schemas import ComparisonOut
 from tests.support.cluster.dispatch_place import Place
 from tests.support.storage.run_results import claim_job, conclude, write_results
 

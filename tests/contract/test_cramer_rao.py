@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from service.core.states import OPEN_STATES, JobState
-from service.dispatch import cramer_rao
+from service.dispatch import run_cramer_rao
 from service.dispatch.dispatcher import Dispatcher
-from service.dispatch.leases import HeldLeases
-from service.sweeps.cramer_rao import StoredBounds
+from service.dispatch.held_leases import HeldLeases
+from service.sweeps.group_cramer_rao import StoredBounds
 from sysid.uncertainty.cramer_rao import cramer_rao_bound
 from tests.support.cluster.inline_executor import InlineExecutor
 from tests.support.limits import LIMIT_SECONDS
@@ -55,7 +55,7 @@ def test_other_jobs_are_carried_out_while_bounds_are_computed(place, monkeypatch
         assert may_go_on.wait(LIMIT_SECONDS)
         return made(problem, theta)
 
-    monkeypatch.setattr(cramer_rao, "cramer_rao_bound", wait_and_compute)
+    monkeypatch.setattr(run_cramer_rao, "cramer_rao_bound", wait_and_compute)
     noisy = place.submit(**NOISY)
     states = []
 
@@ -80,7 +80,7 @@ def test_a_job_is_cancelled_while_its_bounds_are_computed(place, monkeypatch):
         assert may_go_on.wait(LIMIT_SECONDS)
         raise ZeroDivisionError
 
-    monkeypatch.setattr(cramer_rao, "cramer_rao_bound", wait_and_compute)
+    monkeypatch.setattr(run_cramer_rao, "cramer_rao_bound", wait_and_compute)
     noisy = place.submit(**NOISY)
 
     def meanwhile():
@@ -100,18 +100,18 @@ def test_an_error_of_the_numerics_is_a_note_and_the_job_succeeds(place, monkeypa
     def broken(problem, theta):
         raise error
 
-    monkeypatch.setattr(cramer_rao, "cramer_rao_bound", broken)
+    monkeypatch.setattr(run_cramer_rao, "cramer_rao_bound", broken)
     (job,) = carry_out_jobs(place, place.submit(**NOISY))
     assert job.state is JobState.SUCCEEDED
     assert any("no Cramér–Rao bound: internal error" in one for one in list_notes(job))
 
 
 def test_of_more_problems_than_bounds_are_computed_of_a_note_tells(place, monkeypatch):
-    monkeypatch.setattr(cramer_rao, "MAX_PROBLEMS", 2)
+    monkeypatch.setattr(run_cramer_rao, "MAX_PROBLEMS", 2)
     (few,) = carry_out_jobs(place, place.submit(**NOISY, sweep={"axes": [SKIPS[0]]}))
     (many,) = carry_out_jobs(place, place.submit(**NOISY, sweep={"axes": [SKIPS[1]]}))
     assert [len(job.cramer_rao["problems"]) for job in (few, many)] == [2, 2]
-    assert [cramer_rao.LEFT_OUT_NOTE in list_notes(job) for job in (few, many)] == [False, True]
+    assert [run_cramer_rao.LEFT_OUT_NOTE in list_notes(job) for job in (few, many)] == [False, True]
 
 
 SKIPS = [{"path": "/skip", "values": [1, 2]}, {"path": "/skip", "values": [1, 2, 3]}]

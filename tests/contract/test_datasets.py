@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 
 from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
-from service.repositories.datasets import DatasetRepository
-from service.repositories.lineage import LineageLink, LineageRepository
-from service.repositories.models import ModelRepository
-from service.storage.errors import RowNotFound
+from service.repositories.dataset_rows import DatasetRepository
+from service.repositories.lineage_rows import LineageLink, LineageRepository
+from service.repositories.model_rows import ModelRepository
+from service.storage.storage_errors import RowNotFound
 from tests.support.storage.job_rows import Clock, new_dataset
 
 

@@ -10,9 +10,9 @@ from tempfile import TemporaryDirectory
 import httpx
 import pytest
 
-from service.cli import health
+from service.cli import health_command
 from service.client.embedded import find_free_port
-from service.core import metrics
+from service.core.process import service_metrics
 from service.core.settings import Settings
 from service.dispatch import start
 from service.queue.dispatchers import DispatcherRepository, describe_start
@@ -101,7 +101,7 @@ def test_the_health_of_ray_is_its_socket() -> None:
     with TemporaryDirectory() as folder:  # a path of a socket must be short
         words = {"RAY_TMPDIR": folder}
         assert "Ray does not answer at" in check_refusal(run_lagid("health", "ray", **words))
-        path = Path(folder, health.RAY_SOCKET)
+        path = Path(folder, health_command.RAY_SOCKET)
         path.parent.mkdir(parents=True)
         with socket.socket(socket.AF_UNIX) as raylet:
             raylet.bind(str(path))
@@ -114,8 +114,8 @@ def test_a_dispatcher_answers_prometheus_at_its_port_and_works_on_without_it(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     port = find_free_port()
-    metrics.serve_metrics("127.0.0.1", port)
+    service_metrics.serve_metrics("127.0.0.1", port)
     text = httpx.get(f"http://127.0.0.1:{port}/metrics").text
     assert "lagid_evaluations_total" in text
-    metrics.serve_metrics("127.0.0.1", port)
+    service_metrics.serve_metrics("127.0.0.1", port)
     assert re.search(f"metrics are not served at 127.0.0.1:{port}: Address", caplog.text)

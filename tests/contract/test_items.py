@@ -11,23 +11,23 @@ from service.core.errors import Conflict, InvalidRequest, StaleVersion
 from service.core.states import JobState
 from service.items.deletion import HasDependents, delete_item
 from service.items.editing import edit_item
+from service.items.item_schemas import EditIn
 from service.items.items import compute_etag
-from service.items.schemas import EditIn
 from service.jobs.job_links import store_job_links
 from service.queue.leases import LeaseQueue
 from service.queue.reuse import find_computed_runs
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories.audit import list_actions
-from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.lineage import LineageRepository
-from service.repositories.models import ModelRepository
-from service.repositories.references import ReferenceRepository
-from service.repositories.runs import RunRepository
-from service.repositories.search import ItemKind, ListFilter, Term
-from service.repositories.summaries import read_run_table
-from service.storage.errors import RowNotFound
+from service.repositories.audit_rows import list_actions
+from service.repositories.dataset_rows import DatasetRepository
+from service.repositories.job_rows import JobRepository
+from service.repositories.lineage_rows import LineageRepository
+from service.repositories.model_rows import ModelRepository
+from service.repositories.reference_rows import ReferenceRepository
+from service.repositories.run_rows import RunRepository
+from service.repositories.search_conditions import ItemKind, ListFilter, Term
+from service.repositories.summary_rows import read_run_table
 from service.storage.sessions import Database, SessionOwner
+from service.storage.storage_errors import RowNotFound
 from service.storage.tables import DEFAULT_PROJECT, Run, SearchTerm, StoredSummary
 from tests.support.storage.job_rows import (
     job_of,

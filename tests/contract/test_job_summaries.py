@@ -13,12 +13,12 @@ from service.dispatch import job_end
 from service.dispatch.job_runs import JobRuns
 from service.queue.leases import Claim, Lease, LeaseQueue
 from service.queue.run_writes import RunOutcome
-from service.repositories.jobs import JobRepository
-from service.storage.errors import LeaseLost
+from service.repositories.job_rows import JobRepository
 from service.storage.sessions import Database
+from service.storage.storage_errors import LeaseLost
 from service.storage.tables import StoredSummary
 from service.sweeps import job_summary, summary
-from service.sweeps.schemas import SummaryOut
+from service.sweeps.sweep_schemas import SummaryOut
 from tests.support.cluster.dispatch_place import Place
 from tests.support.limits import LIMIT_SECONDS
 from tests.support.storage.databases import record_statements

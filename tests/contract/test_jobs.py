@@ -10,12 +10,12 @@ from service.items.deletion import delete_item
 from service.queue.leases import JobProgress, LeaseQueue
 from service.queue.queue_state import read_queue_state
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories import results
-from service.repositories.events import EventRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.results import list_results
-from service.repositories.search import ListFilter
-from service.storage.errors import (
+from service.repositories import result_rows as results
+from service.repositories.event_rows import EventRepository
+from service.repositories.job_rows import JobRepository
+from service.repositories.result_rows import list_results
+from service.repositories.search_conditions import ListFilter
+from service.storage.storage_errors import (
     InvalidCursor,
     KeyReused,
     RowConflict,

@@ -9,12 +9,12 @@ from service.core.states import JobState
 from service.dispatch import job_runs
 from service.dispatch.job_runs import JobRuns
 from service.jobs import submit
-from service.jobs.schemas import JobIn
+from service.jobs.job_schemas import JobIn
 from service.queue.leases import LeaseOwners, LeaseQueue
 from service.queue.run_writes import RunWriter
-from service.repositories.jobs import JobRepository
+from service.repositories.job_rows import JobRepository
 from service.runs.runs import RunQuery, list_runs
-from service.storage.errors import RowConflict
+from service.storage.storage_errors import RowConflict
 from service.storage.tables import Dataset, Run
 from service.sweeps.groups import GroupKey, SweepGroups
 from service.sweeps.job_summary import load_groups

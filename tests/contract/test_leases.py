@@ -10,7 +10,7 @@ from sqlalchemy.exc import OperationalError
 
 from service.core.states import JobState
 from service.dispatch.dispatcher import Dispatcher
-from service.dispatch.leases import HeldLeases
+from service.dispatch.held_leases import HeldLeases
 from service.queue.dispatchers import DispatcherRepository
 from service.storage.tables import Parcel
 from tests.support.cluster.dispatch_place import Place

@@ -11,10 +11,10 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.core.states import JobState
 from service.items.editing import edit_item
-from service.items.schemas import EditIn
+from service.items.item_schemas import EditIn
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories.jobs import JobRepository
+from service.repositories.job_rows import JobRepository
 from service.storage.sessions import Database
 from tests.support.limits import LIMIT_SECONDS
 from tests.support.storage.job_rows import (

@@ -11,8 +11,8 @@ import obstore
 import pytest
 
 from service.storage import objects
-from service.storage.errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
 from service.storage.objects import open_store
+from service.storage.storage_errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
 from tests.support.storage.object_stores import open_s3_client
 
 FUTURE = datetime.now(UTC) + timedelta(days=1)

@@ -9,13 +9,13 @@ from sqlalchemy import select
 from service.core.states import JobState
 from service.dispatch import dispatcher, held_jobs
 from service.dispatch.dispatcher import Dispatcher
-from service.dispatch.leases import HeldLeases
+from service.dispatch.held_leases import HeldLeases
 from service.queue.leases import Claim, JobProgress, LeaseOwners, LeaseQueue
 from service.queue.notifications import read_queue_status
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories.events import EventRepository
-from service.repositories.jobs import JobRepository
-from service.storage.errors import LeaseLost, RowConflict
+from service.repositories.event_rows import EventRepository
+from service.repositories.job_rows import JobRepository
+from service.storage.storage_errors import LeaseLost, RowConflict
 from service.storage.tables import Checkpoint
 from tests.support.cluster.dispatch_place import Place, carry_out
 from tests.support.cluster.inline_executor import InlineExecutor

@@ -18,8 +18,8 @@ from sqlalchemy.orm import Session
 from service.core.states import JobState
 from service.items.deletion import delete_item, find_dependents
 from service.items.editing import edit_item
+from service.items.item_schemas import EditIn
 from service.items.items import lock_item
-from service.items.schemas import EditIn
 from service.queue import run_writes
 from service.queue.admission import Admission, count_unfinished
 from service.queue.leases import (
@@ -39,22 +39,22 @@ from service.queue.previous_attempts import (
 from service.queue.queue_state import read_queue_state
 from service.queue.reuse import find_computed_runs, take_over_runs
 from service.queue.run_writes import RunOutcome, RunWriter, insert_runs
-from service.repositories.datasets import DatasetRepository
-from service.repositories.events import EventRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.lineage import LineageRepository
-from service.repositories.outcomes import read_estimates
-from service.repositories.references import ReferenceRepository
-from service.repositories.results import list_results
-from service.repositories.runs import RunRepository
-from service.repositories.search import ListFilter, add_terms
-from service.repositories.summaries import (
+from service.repositories.dataset_rows import DatasetRepository
+from service.repositories.event_rows import EventRepository
+from service.repositories.job_rows import JobRepository
+from service.repositories.lineage_rows import LineageRepository
+from service.repositories.outcome_rows import read_estimates
+from service.repositories.reference_rows import ReferenceRepository
+from service.repositories.result_rows import list_results
+from service.repositories.run_rows import RunRepository
+from service.repositories.search_conditions import ListFilter, add_terms
+from service.repositories.summary_rows import (
     find_quietest_run,
     read_run_table,
     read_summary,
     write_summary,
 )
-from service.repositories.trends import read_trend_rows
+from service.repositories.trend_rows import read_trend_rows
 from service.storage.garbage import _find_named_hashes, select_hashes
 from service.storage.sessions import Database
 from service.storage.tables import (

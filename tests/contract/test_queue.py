@@ -10,9 +10,9 @@ from service.core.states import JobState
 from service.queue.leases import JobProgress, Lease, LeaseQueue
 from service.queue.notifications import read_queue_status
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories.events import EventRepository
-from service.repositories.jobs import JobRepository
-from service.storage.errors import LeaseLost, RowConflict
+from service.repositories.event_rows import EventRepository
+from service.repositories.job_rows import JobRepository
+from service.storage.storage_errors import LeaseLost, RowConflict
 from tests.support.limits import LIMIT_SECONDS
 from tests.support.storage.job_rows import (
     Clock,

@@ -11,9 +11,9 @@ from datetime import timedelta
 
 import pytest
 
-from service.core.processes import describe_process, is_awake, is_gone
+from service.core.process.process_identity import describe_process, is_awake, is_gone
 from service.core.states import JobState
-from service.dispatch.leases import HeldLeases
+from service.dispatch.held_leases import HeldLeases
 from service.queue.clocks import choose_database_clock
 from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
 from service.queue.leases import HUNG_AFTER, SPARED_LOSS_FACTOR, LeaseQueue
@@ -51,7 +51,7 @@ def announce(database, owner: str, details) -> None:
 
 def of_a_process_that_has_ended():
     """What a dispatcher told that is no more."""
-    imports = "import json; from service.core.processes import describe_process"
+    imports = "import json; from service.core.process.process_identity import describe_process"
     code = f"{imports}; print(json.dumps(describe_process()))"
     ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     return json.loads(ran.stdout)
@@ -232,7 +232,7 @@ def test_a_dispatcher_that_lives_but_hangs_is_reaped_at_last_and_not_called_gone
 @needs_proc
 def test_a_dispatcher_that_is_stopped_is_reaped_when_its_lease_ends(database) -> None:
     code = (
-        "import json; from service.core.processes import describe_process\n"
+        "import json; from service.core.process.process_identity import describe_process\n"
         "print(json.dumps(describe_process()), flush=True); input()"
     )
     process = subprocess.Popen(

@@ -8,9 +8,9 @@ from service.dispatch.job_runs import JobRuns
 from service.dispatch.recorder import RunRecorder
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories.events import EventRepository
-from service.repositories.history import HistoryPoint, MigrantPoint
-from service.repositories.runs import RunRepository
+from service.repositories.event_rows import EventRepository
+from service.repositories.history_rows import HistoryPoint, MigrantPoint
+from service.repositories.run_rows import RunRepository
 from service.storage.tables import Checkpoint
 from sysid.identification.run import begin_run
 from tests.support.cluster.small_runs import RECORDS, encode_runs, spec

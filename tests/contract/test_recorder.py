@@ -26,14 +26,14 @@ from service.dispatch.recorder import (
 from service.queue.leases import LeaseOwners, LeaseQueue
 from service.queue.packed_results import LAYOUTS, Dialect, PackedResults, pack_rows
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories.events import EventRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.runs import RunRepository
-from service.storage.errors import LeaseLost, ObjectStoreFailed
+from service.repositories.event_rows import EventRepository
+from service.repositories.job_rows import JobRepository
+from service.repositories.run_rows import RunRepository
 from service.storage.objects import StoredObject
 from service.storage.sessions import Database
+from service.storage.storage_errors import LeaseLost, ObjectStoreFailed
 from service.storage.tables import Checkpoint
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.search.archive import make_archive
 from sysid.search.island import Island
 from sysid.search.state import SEARCH_RECORD, Improvement, Migrant

@@ -7,9 +7,9 @@ import pytest
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories.references import ReferenceRepository
-from service.repositories.trends import read_trend_rows
-from service.storage.errors import RowNotFound
+from service.repositories.reference_rows import ReferenceRepository
+from service.repositories.trend_rows import read_trend_rows
+from service.storage.storage_errors import RowNotFound
 from service.storage.tables import Run
 from sysid.core.value_documents import encode
 from sysid.residuals.onset_delay import OnsetDelay

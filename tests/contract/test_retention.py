@@ -8,11 +8,11 @@ from sqlalchemy import func, select, update
 
 from service.core.states import JobState
 from service.items.deletion import delete_item
-from service.repositories.audit import list_actions, record_action
-from service.repositories.datasets import DatasetRepository
-from service.repositories.history import HistoryPoint, pack_history
-from service.repositories.jobs import JobRepository
-from service.repositories.references import ReferenceRepository
+from service.repositories.audit_rows import list_actions, record_action
+from service.repositories.dataset_rows import DatasetRepository
+from service.repositories.history_rows import HistoryPoint, pack_history
+from service.repositories.job_rows import JobRepository
+from service.repositories.reference_rows import ReferenceRepository
 from service.storage.columns import utc_now
 from service.storage.garbage import delete_orphans
 from service.storage.objects import open_store

@@ -6,10 +6,10 @@ import pytest
 
 from service.core.states import JobState
 from service.dispatch import fitted_signals
-from service.repositories.events import EventRepository
-from service.repositories.jobs import JobRepository
-from service.storage.errors import ObjectStoreFailed
+from service.repositories.event_rows import EventRepository
+from service.repositories.job_rows import JobRepository
 from service.storage.garbage import delete_orphans
+from service.storage.storage_errors import ObjectStoreFailed
 from tests.support.cluster.dispatch_place import carry_out
 from tests.support.cluster.inline_executor import InlineExecutor
 from workers import tasks

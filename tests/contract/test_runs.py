@@ -5,10 +5,10 @@ import pytest
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter, insert_runs
-from service.repositories.history import HistoryPoint, MigrantPoint
-from service.repositories.jobs import JobRepository
-from service.repositories.runs import RunRepository
-from service.storage.errors import InvalidCursor, RowNotFound, UnstorableValue
+from service.repositories.history_rows import HistoryPoint, MigrantPoint
+from service.repositories.job_rows import JobRepository
+from service.repositories.run_rows import RunRepository
+from service.storage.storage_errors import InvalidCursor, RowNotFound, UnstorableValue
 from tests.support.storage.job_rows import (
     job_of,
     new_run,

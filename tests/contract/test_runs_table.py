@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import NewRun, RunOutcome, RunWriter, insert_runs
-from service.repositories.jobs import JobRepository
-from service.repositories.runs import RunRepository
+from service.repositories.job_rows import JobRepository
+from service.repositories.run_rows import RunRepository
 from service.storage.sessions import Database
 from service.sweeps import table
 from tests.support.storage.job_rows import claim, new_job, new_run

@@ -8,9 +8,9 @@ from sqlalchemy import select, text
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from service.core.settings import Settings
-from service.storage.errors import UnstorableValue
 from service.storage.open_storage import open_storage
 from service.storage.sessions import Database
+from service.storage.storage_errors import UnstorableValue
 from service.storage.tables import DEFAULT_PROJECT, ApiKey, Base, Job, Project
 from tests.support.storage.databases import copy_sqlite_template
 from tests.support.storage.job_rows import job_of, submit

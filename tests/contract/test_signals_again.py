@@ -8,14 +8,14 @@ import pytest
 
 from service.core.errors import Conflict
 from service.core.states import JobState
-from service.datasets import recordings
+from service.datasets import stored_recordings
 from service.datasets.datasets import add_recording
-from service.formats.mcap import write_fitted_outputs
+from service.formats.mcap.mcap_files import write_fitted_outputs
 from service.jobs.stored_run import load_run
-from service.repositories.datasets import DatasetRepository
+from service.repositories.dataset_rows import DatasetRepository
 from service.runs.fitted import load_fitted_signals
-from service.storage.errors import ObjectStoreFailed
 from service.storage.sessions import Database
+from service.storage.storage_errors import ObjectStoreFailed
 from service.storage.tables import Run
 from sysid.data.records import Recording
 from tests.support.cluster.dispatch_place import Place, carry_out
@@ -143,7 +143,7 @@ def test_a_store_that_is_down_is_not_told_as_a_deleted_dataset(
         raise ObjectStoreFailed("the store is down")
 
     monkeypatch.setattr(type(place.store), "get_bytes", fail)
-    monkeypatch.setattr(recordings, "_recording_cache", recordings._RecordingCache())
+    monkeypatch.setattr(stored_recordings, "_recording_cache", stored_recordings._RecordingCache())
     with pytest.raises(ObjectStoreFailed, match="the store is down"):
         compute_again(place, run.id)
 

@@ -7,8 +7,8 @@ from service.core.states import JobState
 from service.jobs.stored_cells import build_stored_cells, read_axis_groups
 from service.queue.leases import Lease, LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories.summaries import SummaryQuantity, find_quietest_run, read_run_table
-from service.storage.errors import LeaseLost
+from service.repositories.summary_rows import SummaryQuantity, find_quietest_run, read_run_table
+from service.storage.storage_errors import LeaseLost
 from service.storage.tables import DEFAULT_PROJECT, Job
 from service.sweeps.groups import QUANTILES_PER_MILLE, GroupKey, SweepGroups, aggregate_runs
 from tests.support.storage.job_rows import job_of, runs_of, submit

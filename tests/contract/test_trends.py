@@ -7,14 +7,14 @@ import pytest
 
 from service.core.states import JobState
 from service.items.deletion import delete_item
-from service.pages.pages import job_page
+from service.pages.job_pages import job_page
 from service.queue.leases import Lease, LeaseQueue
 from service.queue.run_writes import RunOutcome
-from service.repositories.jobs import JobRepository
-from service.repositories.references import ReferenceRepository
+from service.repositories.job_rows import JobRepository
+from service.repositories.reference_rows import ReferenceRepository
 from service.storage.tables import Job, Run
-from service.trends.schemas import TrendOut
-from service.trends.trend import compute_trend
+from service.trends.batch_trend import compute_trend
+from service.trends.trend_schemas import TrendOut
 from sysid.trends.trend import OutlierRule, compute_drift_limit
 from tests.support.cluster.dispatch_place import Place
 from tests.support.storage.databases import record_statements

@@ -3,24 +3,24 @@
 import pytest
 
 from service.core.states import JobState
-from service.jobs.results import write_result_document
+from service.jobs.stored_results import write_result_document
 from service.queue.leases import Claim, LeaseQueue
 from service.queue.reuse import find_computed_runs, take_over_runs
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.lineage import (
+from service.repositories.dataset_rows import DatasetRepository
+from service.repositories.job_rows import JobRepository
+from service.repositories.lineage_rows import (
     LineageRepository,
     find_datasets_by_name,
     list_dataset_names,
     list_reference_names,
 )
-from service.repositories.models import ModelRepository
-from service.repositories.references import ReferenceRepository
-from service.repositories.summaries import find_quietest_run
-from service.repositories.trends import read_trend_rows
-from service.storage.errors import RowNotFound
+from service.repositories.model_rows import ModelRepository
+from service.repositories.reference_rows import ReferenceRepository
+from service.repositories.summary_rows import find_quietest_run
+from service.repositories.trend_rows import read_trend_rows
 from service.storage.sessions import SessionOwner, find_database
+from service.storage.storage_errors import RowNotFound
 from service.storage.tables import DEFAULT_PROJECT, Project
 from tests.support.storage.job_rows import job_of, new_dataset, new_job, new_run
 from tests.support.storage.run_results import conclude

@@ -7,7 +7,7 @@ from sqlalchemy import text
 
 from service.queue.leases import LeaseQueue
 from service.queue.notifications import open_notifier
-from service.repositories.jobs import JobRepository
+from service.repositories.job_rows import JobRepository
 from tests.support.limits import LIMIT_SECONDS
 from tests.support.storage.job_rows import submit, submit_and_claim
 

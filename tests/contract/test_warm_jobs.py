@@ -10,10 +10,10 @@ from service.core.errors import InvalidRequest
 from service.core.states import JobState
 from service.dispatch import job_parts, job_runs
 from service.dispatch.job_runs import JobRuns
-from service.dispatch.warm_starts import WarmStarts
+from service.dispatch.run_warm_starts import WarmStarts
 from service.jobs import submit
+from service.jobs.job_schemas import ReferenceIn
 from service.jobs.references import accept_reference
-from service.jobs.schemas import ReferenceIn
 from service.queue.leases import LeaseQueue
 from service.storage.tables import Run
 from sysid.core.errors import InvalidSettings

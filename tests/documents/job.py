@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
-from service.jobs.schemas import JobIn
+from service.jobs.job_schemas import JobIn
 from tests.documents.settings import replace_table
 from tests.support.checkout import ROOT
 

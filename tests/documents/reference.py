@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import lagid
-from service.pages.guides import list_notebooks, make_notebook
+from service.pages.documentation.guides import list_notebooks, make_notebook
 from sysid.models.catalogue.load import catalogue, copy_catalogue_document, load_model
 from sysid.models.equation_display import format_equations
 from tests.documents.painter import CHROMIUM, open_painter

@@ -24,7 +24,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from service.pages.guides import list_notebooks
+from service.pages.documentation.guides import list_notebooks
 from tests.documents.painter import open_painter
 from tests.support.checkout import ROOT
 

@@ -20,7 +20,7 @@ from playwright.sync_api import (
 )
 
 from service.api.app import create_app
-from service.api.dependencies import Parts
+from service.api.requests.dependencies import Parts
 from tests.support.limits import LIMIT_SECONDS
 from tests.support.requirements import report_missing
 from tests.support.service.filled_folder import FilledFolder, copy_filled

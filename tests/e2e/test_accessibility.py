@@ -4,8 +4,8 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page
 
+from service.jobs.job_schemas import ReferenceIn
 from service.jobs.references import accept_reference
-from service.jobs.schemas import ReferenceIn
 from tests.e2e.conftest import Site
 
 PATHS = (

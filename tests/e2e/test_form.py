@@ -9,8 +9,8 @@ import pytest
 import yaml
 from playwright.sync_api import Page, expect
 
-from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository
+from service.repositories.dataset_rows import DatasetRepository
+from service.repositories.job_rows import JobRepository
 from tests.e2e.conftest import Site, serve_folder
 from tests.support.limits import LIMIT_SECONDS
 

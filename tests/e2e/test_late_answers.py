@@ -7,7 +7,7 @@ import httpx
 import pytest
 from playwright.sync_api import BrowserContext, Page, Request, Route, expect
 
-from service.repositories.jobs import JobRepository
+from service.repositories.job_rows import JobRepository
 from tests.e2e.conftest import Site
 from tests.e2e.test_form import EQUATIONS, open_form, write_own
 from tests.support.limits import LIMIT_SECONDS

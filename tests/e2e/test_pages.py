@@ -10,7 +10,7 @@ from playwright.sync_api import Page, expect
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
 from service.queue.queue_state import read_queue_state
-from service.repositories.jobs import JobRepository
+from service.repositories.job_rows import JobRepository
 from sysid.figures.theme import plotly_template
 from tests.e2e.conftest import Site
 from tests.support.service.filled_folder import TRUE, end_running, progress

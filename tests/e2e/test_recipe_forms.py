@@ -6,7 +6,7 @@ import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
-from service.repositories.jobs import JobRepository
+from service.repositories.job_rows import JobRepository
 from tests.e2e.conftest import Site
 from tests.support.limits import LIMIT_SECONDS
 

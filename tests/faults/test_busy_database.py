@@ -11,7 +11,7 @@ import pytest
 
 from service.core.states import JobState
 from service.dispatch.dispatcher import Dispatcher
-from service.dispatch.leases import HeldLeases
+from service.dispatch.held_leases import HeldLeases
 from service.queue.orphaned_jobs import reap_jobs
 from service.storage.columns import utc_now
 from tests.support.cluster.dispatch_place import Place, until

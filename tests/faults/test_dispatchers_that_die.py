@@ -10,8 +10,8 @@ import pytest
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.storage.errors import LeaseLost
 from service.storage.sessions import Database
+from service.storage.storage_errors import LeaseLost
 from tests.support.limits import LIMIT_SECONDS
 from tests.support.storage.job_rows import job_of, new_run, runs_of, submit
 

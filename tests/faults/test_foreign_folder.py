@@ -11,7 +11,7 @@ import pytest
 from service.core.states import JobState
 from service.formats.sandbox import read_untrusted
 from sysid.core.child_processes import build_child_command, build_import_path
-from sysid.kernels.compilation import compile_kernel
+from sysid.kernels.compilation.limited_compilation import compile_kernel
 from sysid.kernels.layout import KernelVariant
 from tests.support.checkout import ROOT
 from tests.support.files.foreign_modules import ForeignFolder

@@ -21,9 +21,9 @@ from mcap.records import Chunk, DataEnd, Footer, Header, McapRecord, Message, Me
 from mcap.writer import CompressionType
 
 from service.formats.limits import DEFAULT_LIMITS, UploadLimits
-from service.formats.mcap import read_mcap_with_notes
-from service.formats.mcap_messages import build_schema
-from service.formats.mcap_writer import MCAP_MAGIC
+from service.formats.mcap.mcap_files import read_mcap_with_notes
+from service.formats.mcap.mcap_messages import build_schema
+from service.formats.mcap.mcap_writer import MCAP_MAGIC
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
 from tests.support.files.mcap_files import json_messages, write_foreign_bytes, write_mcap_bytes
@@ -161,7 +161,7 @@ READ_IN_LITTLE_MEMORY = """
 import resource, sys
 from sysid.core.errors import UnreadableFile
 from service.formats.limits import DEFAULT_LIMITS
-from service.formats.mcap import read_mcap_with_notes
+from service.formats.mcap.mcap_files import read_mcap_with_notes
 
 right, *bombs = sys.argv[1:]
 read_mcap_with_notes(right, DEFAULT_LIMITS)  # loads all that reading needs

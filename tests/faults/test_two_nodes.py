@@ -36,7 +36,7 @@ except ClusterUnavailable as error:
 def plain(place: Place, job: str) -> list[dict[str, Any]]:
     """What the job's runs give in this process, without Ray."""
     from service.dispatch.dispatcher import Dispatcher
-    from service.dispatch.leases import HeldLeases
+    from service.dispatch.held_leases import HeldLeases
     from tests.support.cluster.inline_executor import InlineExecutor
 
     dispatcher = Dispatcher(

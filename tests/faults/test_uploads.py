@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import typer
 
-from service.cli.identify import FileOptions, read_input_file
+from service.cli.identify_command import FileOptions, read_input_file
 from service.formats import limits as format_limits
 from service.formats import sandbox
 from service.formats.limits import DEFAULT_LIMITS, MIB

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from service.formats.csv_recordings import read_csv
+from service.formats.tabular.csv_recordings import read_csv
 from sysid.core.errors import UnreadableFile
 from tests.support.profiles import scale_examples
 

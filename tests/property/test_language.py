@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 
 from sysid.language.checker import check_expression
 from sysid.language.functions import FUNCTIONS
-from sysid.language.intervals import bound_expression
 from sysid.language.mathml import format_mathml
 from sysid.language.monomials import collect_terms, to_expression
 from sysid.language.printer import format_expression
 from sysid.language.scope import Scope
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
+from sysid.language.value_intervals import bound_expression
 from tests.support.library.expression_values import meaning
 
 SCOPE = Scope(

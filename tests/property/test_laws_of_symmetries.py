@@ -9,7 +9,7 @@ import pytest
 
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel
-from sysid.identifiability.scaling import find_scalings
+from sysid.identifiability.scaling_symmetries import find_scalings
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import EstimatedInitial, Model, build_initial_parameters, name_initial_state
 from sysid.models.parameters import Parameter

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from mcap.reader import make_reader
 
-from service.formats import mcap_writer
-from service.formats.mcap import read_mcap
-from service.formats.topics import choose_clock
+from service.formats.mcap import mcap_writer
+from service.formats.mcap.mcap_files import read_mcap
+from service.formats.mcap.topics import choose_clock
 from sysid.data.records import HOLDS, Channel, History, Recording
 from tests.support.files.mcap_files import write_mcap_bytes
 from tests.support.profiles import scale_examples

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sysid.core.errors import InvalidModel
 from sysid.models.catalogue.load import catalogue, copy_catalogue_document
-from sysid.models.documents import parse_yaml
+from sysid.models.document_reader import parse_yaml
 from sysid.models.parse import parse_model
 
 junk = st.recursive(

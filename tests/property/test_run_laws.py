@@ -26,7 +26,7 @@ from sysid.identification.run import (
 )
 from sysid.islands.archipelago import create_islands, make_plans
 from sysid.islands.evolve import is_island_resting
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.islands.stopping import count_restarts
 from sysid.search.island import Island, evolve
 from sysid.search.operators import decode

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.formats.time_columns import parse_stamps
+from service.formats.tabular.time_columns import parse_stamps
 from sysid.core.errors import UnreadableFile
 from tests.support.profiles import scale_examples
 

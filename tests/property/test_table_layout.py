@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from service.formats.cells import classify_cell
-from service.formats.csv_recordings import read_csv
-from service.formats.table_layout import PEEK_ROWS, SEPARATORS
+from service.formats.tabular.cells import classify_cell
+from service.formats.tabular.csv_recordings import read_csv
+from service.formats.tabular.table_layout import PEEK_ROWS, SEPARATORS
 from tests.support.profiles import scale_examples
 
 NAMES = ("u", "y", "P1", "Druck", "flow rate", "x2", "T", "Ventil_1")

@@ -15,7 +15,7 @@ from sysid.core import child_processes
 from sysid.core.child_processes import build_child_command
 
 WORK = {
-    "sysid.kernels.compiler_child": "compile_assembly",
+    "sysid.kernels.compilation.compiler_child": "compile_assembly",
     "service.formats.sandbox_child": "read_file",
 }
 """The children, and the function of each that is replaced."""

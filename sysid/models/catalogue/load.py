@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from sysid.core.errors import Fault, InvalidModel, UnknownModel
-from sysid.models.documents import MAX_DOCUMENT_CHARACTERS, parse_yaml
+from sysid.models.document_reader import MAX_DOCUMENT_CHARACTERS, parse_yaml
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 

@@ -12,9 +12,10 @@ import pytest
 from sqlalchemy import update
 
 from service.access.tokens import hash_secret, parse_token
-from service.api import events, failure_delay
-from service.api.access_check import COOKIE
-from service.repositories.keys import note_use
+from service.api.requests import failure_delay
+from service.api.requests.access_check import COOKIE
+from service.api.routes import event_routes
+from service.repositories.key_rows import note_use
 from service.storage.tables import ApiKey, WebSession
 from tests.support.limits import LIMIT_SECONDS
 from tests.support.service.keyed_service import Guarded, guard
@@ -250,7 +251,7 @@ def test_a_session_ends_with_its_key_and_its_time(keyed_service: Guarded) -> Non
 def test_an_open_event_stream_ends_after_its_key(
     keyed_service: Guarded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(events, "KEEP_ALIVE_S", 0.05)
+    monkeypatch.setattr(event_routes, "KEEP_ALIVE_S", 0.05)
     token, parts = keyed_service.add_key(), keyed_service.parts
     job, has_waited, wait_for_news = submit(parts.database), Event(), parts.feed.wait_for_news
 

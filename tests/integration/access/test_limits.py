@@ -9,17 +9,17 @@ import pytest
 from service.core.errors import BudgetExceeded, QuotaExceeded
 from service.core.settings import Settings
 from service.core.states import JobState
-from service.dispatch.leases import HeldLeases
+from service.dispatch.held_leases import HeldLeases
 from service.jobs.submit import check_limits, resume_job
 from service.queue.daily_limit import stop_overruns
 from service.queue.leases import JobProgress, Lease, LeaseQueue
-from service.repositories.audit import list_actions
-from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.projects import ProjectRepository
+from service.repositories.audit_rows import list_actions
+from service.repositories.dataset_rows import DatasetRepository
+from service.repositories.job_rows import JobRepository
+from service.repositories.project_rows import ProjectRepository
 from service.storage.columns import utc_now
-from service.storage.errors import RowConflict, RowNotFound
 from service.storage.sessions import Database, SessionOwner, find_project
+from service.storage.storage_errors import RowConflict, RowNotFound
 from service.storage.tables import Job
 from tests.support.storage.databases import record_statements
 from tests.support.storage.job_rows import claim, job_of, new_dataset, new_job, state_of, submit

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.api.access_check import COOKIE
 from service.api.app import create_app
+from service.api.requests.access_check import COOKIE
 from tests.support.service.keyed_service import Guarded, guard
 from tests.support.service.web_app import read_faults, settings_of
 

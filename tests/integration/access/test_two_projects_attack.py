@@ -12,10 +12,10 @@ from fastapi.routing import APIRoute
 from sqlalchemy import select
 
 from service.access.scopes import find_needed_scope
+from service.jobs.job_schemas import ReferenceIn
 from service.jobs.references import accept_reference
-from service.jobs.schemas import ReferenceIn
 from service.models.models import add_model
-from service.repositories.audit import list_actions
+from service.repositories.audit_rows import list_actions
 from service.storage.tables import DEFAULT_PROJECT, ApiKey, AuditEntry, Base, Project
 from sysid.models.catalogue.load import copy_catalogue_document
 from sysid.results.figures import FigureName

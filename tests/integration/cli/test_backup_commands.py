@@ -6,7 +6,7 @@ from pathlib import Path
 
 from service.api.app import create_app
 from service.client.client import Client
-from service.core.folder_lock import lock_folder
+from service.core.process.folder_lock import lock_folder
 from tests.support.service.commands import CommandResult, check_refusal, run_lagid
 from tests.support.service.web_app import recording, settings_of
 from tests.support.service.web_server import serve_in_thread

@@ -14,12 +14,12 @@ import pytest
 
 from lagid import Loss
 from service.cli.common import apply_setting
-from service.cli.identify import FIELD_ORIGINS
-from service.core.documents import parse_yaml
-from service.jobs.schemas import JobIn
+from service.cli.identify_command import FIELD_ORIGINS
+from service.core.bodies.user_documents import parse_yaml
+from service.jobs.job_schemas import JobIn
 from service.plants.tube import Tube
 from sysid.core.text import SETTING, rewrite_settings
-from sysid.identification.arguments import write_setting
+from sysid.identification.identify_arguments import write_setting
 from tests.support.service.commands import run_lagid
 from tests.support.source_facts import list_modules
 

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from service.api.app import create_app
-from service.api.dependencies import Parts
+from service.api.requests.dependencies import Parts
 from service.client.client import Client
 from service.core.states import JobState
-from service.repositories.jobs import JobRepository
+from service.repositories.job_rows import JobRepository
 from tests.support.checkout import ROOT
 from tests.support.limits import LIMIT_SECONDS
 from tests.support.service.local_runs import carry_out_job

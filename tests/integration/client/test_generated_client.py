@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from service.api.write_contract import DOCUMENT_FILE
+from service.api.contract.write_contract import DOCUMENT_FILE
 from service.client.embedded import run_embedded_service
 from tests.support.checkout import ROOT
 from tests.support.limits import LIMIT_SECONDS

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from service.pages.guides import list_notebooks, make_notebook
+from service.pages.documentation.guides import list_notebooks, make_notebook
 from tests.documents.tutorials import find_free_port
 from tests.support.checkout import ROOT
 from tests.support.requirements import report_missing

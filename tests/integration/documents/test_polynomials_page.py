@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from sysid.data.records import Channel, Record
-from sysid.models.documents import parse_yaml
+from sysid.models.document_reader import parse_yaml
 from tests.documents.tutorials import run_cell
 from tests.support.checkout import ROOT
 

@@ -12,7 +12,7 @@ import pytest
 
 from service.api.app import create_app
 from service.dispatch.dispatcher import Dispatcher
-from service.dispatch.leases import HeldLeases
+from service.dispatch.held_leases import HeldLeases
 from tests.support.checkout import ROOT
 from tests.support.cluster.inline_executor import InlineExecutor
 from tests.support.limits import LIMIT_SECONDS

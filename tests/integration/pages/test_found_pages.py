@@ -16,17 +16,17 @@ from service.api.app import create_app
 from service.core.settings import Settings
 from service.core.shown_settings import list_settings
 from service.datasets.datasets import add_recording
+from service.jobs.job_schemas import ReferenceIn
 from service.jobs.references import accept_reference
-from service.jobs.schemas import ReferenceIn
 from service.models.models import add_model
-from service.pages import pages
-from service.pages.lineage import MAX_CHARACTERS, LineageDrawing, draw_lineage
-from service.repositories.lineage import LineageRepository
+from service.pages import job_pages
+from service.pages.lineage_drawing import MAX_CHARACTERS, LineageDrawing, draw_lineage
+from service.repositories.lineage_rows import LineageRepository
 from service.storage.tables import Job
 from sysid.data.holds import HOLD_TEXTS, HOLDS, HoldSetting
 from sysid.data.records import Channel, Recording
 from sysid.figures.data import ExperimentTraces, OutputTraces, SignalTrace
-from sysid.figures.signals import plot_comparison
+from sysid.figures.signal_figures import plot_comparison
 from sysid.models.catalogue.load import copy_catalogue_document
 from tests.support.service.filled_folder import FilledFolder
 from tests.support.service.web_app import parts_of, settings_of
@@ -194,7 +194,7 @@ def test_the_lineage_of_an_open_job_follows_when_it_has_ended(
         drawn.append(shown.id)
         return draw_lineage(session, shown)
 
-    monkeypatch.setattr(pages, "draw_lineage", draw)
+    monkeypatch.setattr(job_pages, "draw_lineage", draw)
     shown = {
         job: client.get(f"/jobs/{job}").text
         for job in (filled_folder.running, filled_folder.finished)

@@ -7,7 +7,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
-from service.pages import guides
+from service.pages.documentation import guides
 from tests.support.checkout import ROOT
 from tests.support.service.web_app import settings_of
 

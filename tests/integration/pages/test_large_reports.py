@@ -15,10 +15,10 @@ from fastapi.testclient import TestClient
 from service.api.app import create_app
 from service.core.states import JobState
 from service.jobs import submit
-from service.jobs.schemas import JobIn
+from service.jobs.job_schemas import JobIn
 from service.queue.leases import Claim, LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories.runs import RunRepository
+from service.repositories.run_rows import RunRepository
 from service.storage.sessions import Database
 from tests.support.service.web_app import parts_of, recording, settings_of, store_csv
 from tests.support.storage.run_results import write_result

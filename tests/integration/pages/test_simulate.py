@@ -14,10 +14,10 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.api.app import create_app
-from service.control.closed_loop import suggest_controller
-from service.core.concurrency import MAX_RUNNING, MAX_WAITING, simulation_limit
+from service.control.loop_answer import suggest_controller
+from service.core.process.concurrency import MAX_RUNNING, MAX_WAITING, simulation_limit
 from service.jobs.stored_run import StoredRun
-from service.pages.simulate import _default_values, _FormContext
+from service.pages.simulation_page import _default_values, _FormContext
 from service.storage.tables import Dataset, Job, Run
 from sysid.models.catalogue.load import load_model
 from sysid.search import refine

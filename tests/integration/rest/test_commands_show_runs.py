@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 from service.cli import common
 from service.cli.common import FieldOrigins
 from service.cli.main import build_program
-from service.cli.tables import print_trend
+from service.cli.printed_tables import print_trend
 from service.client.calls import ProblemError
 from service.client.client import Client
 from tests.support.service.local_runs import identify_job

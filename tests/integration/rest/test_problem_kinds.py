@@ -2,8 +2,8 @@
 
 from starlette.testclient import TestClient
 
-from service.api.health import PROBLEM_KINDS
-from service.api.problems import STATUS_KINDS
+from service.api.requests.problems import STATUS_KINDS
+from service.api.routes.health_routes import PROBLEM_KINDS
 from service.core import errors
 from service.core.errors import ServiceError
 

@@ -8,7 +8,7 @@ from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
 from service.api.app import create_app
-from service.api.dependencies import Parts
+from service.api.requests.dependencies import Parts
 from service.cli.main import build_program
 from tests.support.service.local_runs import identify_job
 from tests.support.service.web_app import read_faults, recording, settings_of, store_csv

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.api import bodies
 from service.api.app import create_app
-from service.api.middleware import BodyLimit
+from service.api.requests import bodies
+from service.api.requests.middleware import BodyLimit
 from service.core.errors import InvalidRequest, TooLarge
 from service.core.settings import Settings
 from tests.support.service.web_app import CSV, await_in_thread, read_faults, recording, settings_of

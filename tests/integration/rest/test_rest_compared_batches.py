@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from service.cli import common
 from service.cli.main import build_program
 from service.client.client import Client
-from service.trends import trend as trends
+from service.trends import batch_trend
 from tests.integration.rest.test_rest_reidentify import find_quantity, read_trend, run_at
 from tests.support.service.tube_batch import BODY, LENGTHS, ServedBatch, identify_batch
 from tests.support.service.web_app import read_faults
@@ -229,7 +229,7 @@ def test_a_reference_batch_that_is_too_large_for_a_trend_is_a_note(
     batch = [{"x": x, "datasets": compared_batch.datasets[x][:1]} for x in LENGTHS[:3]]
     reference = run_at(compared_batch, compared_batch.job, 2.0)
     job = identify_batch(compared_batch.server, batch=batch, reference=reference)
-    monkeypatch.setattr(trends, "MAX_RUNS", 3)
+    monkeypatch.setattr(batch_trend, "MAX_RUNS", 3)
     found = read_trend(compared_batch, job)
     (note,) = found["notes"]
     assert "has 4 runs" in note

@@ -10,11 +10,16 @@ import pytest
 from jsonschema import Draft202012Validator
 from starlette.testclient import TestClient
 
-from service.api import examples
 from service.api.app import create_app
-from service.api.openapi import list_operations
-from service.api.write_contract import DOCUMENT_FILE, TYPES_FILE, write_document, write_types
-from service.core.value_schemas import describe_value
+from service.api.contract import examples
+from service.api.contract.openapi import list_operations
+from service.api.contract.write_contract import (
+    DOCUMENT_FILE,
+    TYPES_FILE,
+    write_document,
+    write_types,
+)
+from service.core.bodies.value_schemas import describe_value
 from sysid.core.value_documents import list_fields
 from sysid.results.result import Result
 from sysid.uncertainty.estimates import Estimate

@@ -10,8 +10,8 @@ import pytest
 from mcap.reader import make_reader
 from starlette.testclient import TestClient
 
-from service.core.text import format_subtracted
-from service.formats.mcap import read_mcap
+from service.core.label_text import format_subtracted
+from service.formats.mcap.mcap_files import read_mcap
 from tests.support.service.web_app import CSV, read_faults, recording, store_csv
 
 SIMULATION: dict[str, Any] = {

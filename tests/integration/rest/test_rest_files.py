@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from service.formats.mcap import read_mcap
+from service.formats.mcap.mcap_files import read_mcap
 from tests.support.files.experiment_files import (
     INPUT,
     OUTPUT,

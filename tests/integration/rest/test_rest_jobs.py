@@ -10,8 +10,8 @@ from service.core.states import JobState
 from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunWriter
-from service.repositories.history import HistoryPoint
-from service.repositories.models import ModelRepository
+from service.repositories.history_rows import HistoryPoint
+from service.repositories.model_rows import ModelRepository
 from service.storage.tables import Job
 from tests.support.service.web_app import parts_of, read_faults, recording, store_csv
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from service.api.dependencies import Parts
+from service.api.requests.dependencies import Parts
 from tests.support.service.local_runs import identify_job
 from tests.support.service.web_app import parts_of, read_faults, store_csv
 from tests.unit.sysid.noise_models.test_noise_model_choice import (

@@ -8,7 +8,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
-from service.datasets.recordings import load_recording
+from service.datasets.stored_recordings import load_recording
 from service.sweeps import output_spread
 from tests.support.service.local_runs import carry_out_job
 from tests.support.service.web_app import parts_of, read_faults, recording, settings_of, store_csv

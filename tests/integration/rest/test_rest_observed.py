@@ -10,10 +10,10 @@ from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
-from service.core.logs import ACCESS_LOGGER, JsonFormatter, TextFormatter
+from service.core.process.logs import ACCESS_LOGGER, JsonFormatter, TextFormatter
 from service.queue.dispatchers import LEASE_SECONDS_KEY, STARTING_KEY, DispatcherRepository
-from service.repositories.jobs import JobRepository
-from service.storage.errors import ObjectStoreFailed
+from service.repositories.job_rows import JobRepository
+from service.storage.storage_errors import ObjectStoreFailed
 from tests.support.service.web_app import parts_of, read_faults
 
 Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
@@ -75,7 +75,7 @@ def test_an_unexpected_error_is_counted_logged_and_has_its_id(
     assert answer.headers["x-request-id"] == answer.json()["request_id"] == "r1"
     after = find_value(read_samples(server), "lagid_http_requests_total", **labels)
     assert after == before + 1
-    (record,) = [one for one in caplog.records if one.name == "service.api.problems"]
+    (record,) = [one for one in caplog.records if one.name == "service.api.requests.problems"]
     assert "ZeroDivisionError" in record.getMessage()
 
 

@@ -15,7 +15,7 @@ from service.api.app import create_app
 from service.api.store_probe import PROBE_SECONDS
 from service.datasets import datasets
 from service.formats import sandbox
-from service.storage.errors import ObjectStoreFailed
+from service.storage.storage_errors import ObjectStoreFailed
 from tests.support.service.web_app import CSV, parts_of, read_faults, recording, settings_of
 
 

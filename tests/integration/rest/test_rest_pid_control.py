@@ -9,7 +9,7 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.cli import common, runs
+from service.cli import common, run_commands
 from service.client.client import Client
 from tests.support.service.local_runs import identify_job
 from tests.support.service.web_app import Through, parts_of, read_faults
@@ -282,7 +282,7 @@ def test_the_command_line_tells_controller_rule_and_margins(
     def run_command(**control: Any) -> str:
         body = {**BODY, "parameters": PLANT, "control": {**CONTROL, **control}}
         file.write_text(json.dumps(body))
-        done = CliRunner().invoke(runs.app, ["simulate", plants.lag, str(file)])
+        done = CliRunner().invoke(run_commands.app, ["simulate", plants.lag, str(file)])
         assert done.exit_code == 0, done.output
         return done.output
 

@@ -8,9 +8,9 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.cli import common, datasets
+from service.cli import common, dataset_commands
 from service.client.client import Client
-from service.formats.mcap import read_mcap
+from service.formats.mcap.mcap_files import read_mcap
 from sysid.data.records import Recording
 from tests.support.service.web_app import Through, read_faults
 
@@ -132,8 +132,11 @@ def test_the_command_line_makes_a_tube_from_its_length(
     file = tmp_path / "short.yaml"
     file.write_text("{samples: 100, parameters: {length_m: 10}}")
     words = ["simulate", str(file), "--plant", "tube", "--set", "length_m=30", "--name", "long"]
-    done = run(datasets.app, words)
+    done = run(dataset_commands.app, words)
     assert done.exit_code == 0, done.output
     assert "long: 100 samples" in done.output
-    assert run(datasets.app, ["simulate"]).exit_code == 1
-    assert run(datasets.app, ["simulate", "--plant", "tube", "--set", "length_m"]).exit_code == 2
+    assert run(dataset_commands.app, ["simulate"]).exit_code == 1
+    assert (
+        run(dataset_commands.app, ["simulate", "--plant", "tube", "--set", "length_m"]).exit_code
+        == 2
+    )

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 import service.runs.profiles
 from service.cli import common
-from service.cli.runs import app as runs_app
+from service.cli.run_commands import app as runs_app
 from service.client.client import Client
 from tests.support.service.local_runs import ServedRun, serve_run
 from tests.support.service.web_app import Through, read_faults

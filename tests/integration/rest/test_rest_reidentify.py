@@ -7,8 +7,7 @@ from urllib.parse import quote
 import pytest
 from typer.testing import CliRunner
 
-from service.cli import common
-from service.cli import reidentify as reidentifying
+from service.cli import common, reidentify_command
 from service.cli.main import build_program
 from service.client.client import Client
 from tests.support.service.local_runs import carry_out_job
@@ -321,7 +320,7 @@ def command(served_batch: ServedBatch, monkeypatch: pytest.MonkeyPatch) -> CliRu
         return opened.job(job)
 
     monkeypatch.setattr(common, "connect_client", connect_in_process)
-    monkeypatch.setattr(f"{reidentifying.__name__}.follow_job", follow)
+    monkeypatch.setattr(f"{reidentify_command.__name__}.follow_job", follow)
     return CliRunner()
 
 

@@ -12,14 +12,14 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.api.dependencies import Parts
+from service.api.requests.dependencies import Parts
 from service.cli import common
-from service.cli.runs import app as runs_app
+from service.cli.run_commands import app as runs_app
 from service.client.async_client import AsyncClient
 from service.client.client import Client
-from service.datasets import recordings
-from service.storage.errors import ObjectMissing
+from service.datasets import stored_recordings
 from service.storage.objects import ObjectStore
+from service.storage.storage_errors import ObjectMissing
 from sysid.data.records import Recording
 from tests.support.service.local_runs import identify_job
 from tests.support.service.web_app import Through, await_in_thread, parts_of, read_faults, store_csv
@@ -216,7 +216,7 @@ def test_where_the_inputs_are_lost_whiteness_is_told_all_the_same(
     def lost(store: ObjectStore, sha256: str) -> Recording:
         raise ObjectMissing(sha256)
 
-    monkeypatch.setattr(recordings, "load_recording", lost)
+    monkeypatch.setattr(stored_recordings, "load_recording", lost)
     asked = fits.server.get(f"/v1/runs/{fits.runs[0]}/residuals").json()
     assert [one["test"] for one in asked["tests"]] == ["whiteness"]
     assert "cannot be read any more" in asked["note"]

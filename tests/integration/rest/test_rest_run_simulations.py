@@ -10,9 +10,9 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.cli import common, runs
+from service.cli import common, run_commands
 from service.client.client import Client
-from service.formats.mcap import read_mcap
+from service.formats.mcap.mcap_files import read_mcap
 from tests.support.library.catalogue_cases import ACTUATOR
 from tests.support.service.local_runs import identify_job
 from tests.support.service.web_app import Through, parts_of, read_faults, recording, store_csv
@@ -346,12 +346,12 @@ def test_the_command_line_tells_the_measures_of_the_step(
     monkeypatch.setattr(common, "connect_client", connect_in_process)
     file = tmp_path / "loop.json"
     file.write_text(json.dumps({**LOOP, "store": True}))
-    done = CliRunner().invoke(runs.app, ["simulate", plants.arm, str(file)])
+    done = CliRunner().invoke(run_commands.app, ["simulate", plants.arm, str(file)])
     assert done.exit_code == 0, done.output
     told = ("theta [rad]: 601 samples", "overshoot of the reference: ", "settling time (2 %): 1.")
     for part in (*told, "stored as"):
         assert part in done.output
-    raw = CliRunner().invoke(runs.app, ["simulate", plants.arm, str(file), "--json"])
+    raw = CliRunner().invoke(run_commands.app, ["simulate", plants.arm, str(file), "--json"])
     assert json.loads(raw.output)["metrics"]["output"] == "theta"
 
 

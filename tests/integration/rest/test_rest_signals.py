@@ -10,11 +10,11 @@ import pytest
 from mcap.reader import make_reader
 from starlette.testclient import TestClient
 
-from service.api.dependencies import Parts
+from service.api.requests.dependencies import Parts
 from service.dispatch import fitted_signals
-from service.formats.mcap import read_fitted_outputs, read_mcap
-from service.repositories.runs import RunRepository
-from service.storage.errors import ObjectStoreFailed
+from service.formats.mcap.mcap_files import read_fitted_outputs, read_mcap
+from service.repositories.run_rows import RunRepository
+from service.storage.storage_errors import ObjectStoreFailed
 from service.storage.tables import Run
 from tests.support.files.mcap_files import read_run_record
 from tests.support.service.local_runs import identify_job

@@ -12,9 +12,9 @@ from starlette.testclient import TestClient
 
 from service.api import event_feed
 from service.api.app import create_app
-from service.api.dependencies import Parts
 from service.api.event_feed import EventFeed
-from service.repositories.events import JobHead
+from service.api.requests.dependencies import Parts
+from service.repositories.event_rows import JobHead
 from tests.support.limits import LIMIT_SECONDS
 from tests.support.service.web_app import (
     await_in_thread,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from service.formats.mcap import read_fitted_outputs
+from service.formats.mcap.mcap_files import read_fitted_outputs
 from sysid.data.records import Channel
 from sysid.models.parse import parse_model
 from sysid.simulation.simulate import simulate

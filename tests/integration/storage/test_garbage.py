@@ -8,8 +8,8 @@ import pytest
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository
+from service.repositories.dataset_rows import DatasetRepository
+from service.repositories.job_rows import JobRepository
 from service.storage import garbage as garbage_collection
 from service.storage import statements
 from service.storage.columns import utc_now

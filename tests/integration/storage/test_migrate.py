@@ -9,8 +9,8 @@ import pytest
 from sqlalchemy import inspect, text
 
 from service.storage import migrate, sessions
-from service.storage.errors import DatabaseNotAtHead, DatabaseUnknown, UnknownRevision
 from service.storage.sessions import Database
+from service.storage.storage_errors import DatabaseNotAtHead, DatabaseUnknown, UnknownRevision
 from service.storage.tables import Base, Project
 from tests.support.limits import LIMIT_SECONDS
 from tests.support.storage.databases import empty_postgres

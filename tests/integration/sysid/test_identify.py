@@ -8,7 +8,7 @@ from sysid.core.settings import GeneticAlgorithm, Loss, Stop
 from sysid.data.noise import Noise
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.models.catalogue.load import load_model
 from sysid.results.identification import Identification
 from sysid.search.refine import refine_candidates

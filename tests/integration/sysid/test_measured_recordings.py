@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from service.formats.csv_recordings import read_csv
+from service.formats.tabular.csv_recordings import read_csv
 from sysid.data.derivations import derive_recording
 from sysid.data.records import Recording
 from tests.support.requirements import DATA

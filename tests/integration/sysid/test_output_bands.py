@@ -20,7 +20,7 @@ from sysid.results.bands import pool_noise
 from sysid.results.figures import draw_figures
 from sysid.results.identification import Identification
 from sysid.search.refine import refine_candidates
-from sysid.simulation.metrics import ChannelMetrics
+from sysid.simulation.fit_metrics import ChannelMetrics
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
 from sysid.uncertainty.analysis import analyse_estimate

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.datasets.signal_channels import map_channels
-from service.formats.csv_recordings import read_csv
+from service.formats.tabular.csv_recordings import read_csv
 from sysid.core.settings import Loss
 from sysid.data.derivations import derive_recording
 from sysid.data.records import Record

@@ -9,7 +9,7 @@ import pytest
 
 from service.core.states import JobState
 from service.dispatch.dispatcher import Dispatcher
-from service.dispatch.leases import HeldLeases
+from service.dispatch.held_leases import HeldLeases
 from service.queue.admission import Admission
 from service.queue.leases import Claim
 from service.storage.objects import open_store

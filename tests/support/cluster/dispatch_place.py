@@ -15,12 +15,12 @@ from service.core.settings import Settings
 from service.core.states import OPEN_STATES, JobState
 from service.datasets.datasets import add_recording
 from service.dispatch.dispatcher import Dispatcher
-from service.dispatch.leases import HeldLeases
+from service.dispatch.held_leases import HeldLeases
 from service.dispatch.supervisor import clear_session, to_environment
-from service.jobs.schemas import JobIn
+from service.jobs.job_schemas import JobIn
 from service.jobs.submit import submit_job
-from service.repositories.jobs import JobRepository
-from service.repositories.runs import RunRepository
+from service.repositories.job_rows import JobRepository
+from service.repositories.run_rows import RunRepository
 from service.storage.objects import ObjectStore, open_store
 from service.storage.sessions import Database
 from service.storage.tables import Job, Run

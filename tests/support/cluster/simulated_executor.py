@@ -6,7 +6,7 @@ from functools import cache
 from typing import Any
 
 from sysid.identification.run import begin_run
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from tests.support.cluster.small_runs import RECORDS, ListedRuns, Notebook, spec
 from workers.protocol import (
     AdvanceRun,

@@ -9,7 +9,7 @@ import numpy as np
 from sysid.core.settings import FitSettings, GeneticAlgorithm, Stop
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.models.catalogue.load import copy_catalogue_document
 from sysid.results.identification import Identification
 from tests.support.limits import LIMIT_SECONDS

@@ -7,7 +7,7 @@ from io import BytesIO
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from service.formats.mcap import write_recording
+from service.formats.mcap.mcap_files import write_recording
 from sysid.data.records import Recording
 
 

@@ -9,7 +9,7 @@ from sysid.core.settings import PredictionKind
 from sysid.core.types import FloatArray
 from sysid.data.noise import Noise, add_output_noise
 from sysid.data.records import Channel, Hold, Record
-from sysid.kernels.reads import is_difference
+from sysid.kernels.signals.past_reads import is_difference
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model, replace_substeps
 from sysid.simulation.simulate import simulate

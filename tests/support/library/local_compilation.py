@@ -9,10 +9,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from sysid.kernels import build
+from sysid.kernels.compilation import build
+from sysid.kernels.compilation.machine_code import compile_assembly
 from sysid.kernels.kernel import emit_kernel
 from sysid.kernels.layout import KernelVariant
-from sysid.kernels.machine_code import compile_assembly
 from sysid.models.model import Model
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.models.catalogue.load import load_model
 from sysid.search.island import Island
 from sysid.simulation.problem import Problem

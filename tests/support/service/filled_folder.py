@@ -19,13 +19,13 @@ import numpy as np
 from service.core.settings import Settings
 from service.core.states import JobState
 from service.datasets.datasets import add_recording
-from service.formats.mcap import FitRole, FittedOutput, write_fitted_outputs
+from service.formats.mcap.mcap_files import FitRole, FittedOutput, write_fitted_outputs
 from service.jobs import submit
-from service.jobs.schemas import JobIn
+from service.jobs.job_schemas import JobIn
 from service.queue.leases import Claim, JobProgress, LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.repositories.history import HistoryPoint, MigrantPoint
-from service.repositories.runs import RunRepository
+from service.repositories.history_rows import HistoryPoint, MigrantPoint
+from service.repositories.run_rows import RunRepository
 from service.storage.objects import ObjectStore, open_store
 from service.storage.sessions import Database
 from sysid.data.records import Channel, Recording

@@ -10,8 +10,8 @@ from starlette.testclient import TestClient
 from service.access.keys import create_key
 from service.access.scopes import Scope
 from service.api.app import create_app
-from service.api.dependencies import Parts
-from service.repositories.projects import ProjectRepository
+from service.api.requests.dependencies import Parts
+from service.repositories.project_rows import ProjectRepository
 from service.storage.migrate import upgrade_database
 from service.storage.sessions import SessionOwner
 from service.storage.tables import DEFAULT_PROJECT

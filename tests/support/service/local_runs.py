@@ -9,15 +9,15 @@ from typing import Any, NamedTuple
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
-from service.api.dependencies import Parts
-from service.dispatch.cramer_rao import build_bounds_maker
+from service.api.requests.dependencies import Parts
 from service.dispatch.encoding import describe_program
 from service.dispatch.job_runs import JobRuns
 from service.dispatch.recorder import RunRecorder
+from service.dispatch.run_cramer_rao import build_bounds_maker
 from service.jobs import submit
-from service.jobs.schemas import JobIn
+from service.jobs.job_schemas import JobIn
 from service.queue.leases import LeaseQueue, ProgramOfJob
-from service.repositories.runs import RunRepository
+from service.repositories.run_rows import RunRepository
 from tests.support.cluster.inline_executor import InlineExecutor
 from tests.support.service.web_app import parts_of, recording, settings_of, store_csv
 from workers.scheduler import Scheduler

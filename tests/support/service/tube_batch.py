@@ -14,7 +14,7 @@ import numpy as np
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
-from service.api.dependencies import Parts
+from service.api.requests.dependencies import Parts
 from tests.support.service.local_runs import carry_out_job
 from tests.support.service.web_app import parts_of, settings_of, store_csv
 

@@ -11,10 +11,10 @@ import httpx
 import numpy as np
 from starlette.testclient import TestClient
 
-from service.api.dependencies import Parts
+from service.api.requests.dependencies import Parts
 from service.core.settings import Settings
 from service.datasets.datasets import add_recording, hash_source
-from service.formats.csv_recordings import read_csv
+from service.formats.tabular.csv_recordings import read_csv
 from tests.support.storage.databases import copy_sqlite_template
 
 CSV = {"content-type": "text/csv"}

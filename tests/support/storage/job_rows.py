@@ -7,9 +7,9 @@ from sqlalchemy import select
 from service.core.states import JobState
 from service.queue.leases import Claim, Lease, LeaseQueue
 from service.queue.run_writes import NewRun, RunOutcome, RunWriter
-from service.repositories.datasets import NewDataset
-from service.repositories.jobs import JobRepository, NewJob
-from service.repositories.runs import RunRepository
+from service.repositories.dataset_rows import NewDataset
+from service.repositories.job_rows import JobRepository, NewJob
+from service.repositories.run_rows import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import Job, Parcel, Run
 

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from service.dispatch.encoding import ResultEncoder
-from service.jobs.results import write_result_document
+from service.jobs.stored_results import write_result_document
 from service.queue.leases import Lease, LeaseQueue
 from service.queue.packed_results import PackedResults
 from service.queue.run_writes import RunWriter
 from service.storage.sessions import Database
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.residuals.residual_tests import ResidualTests
 from sysid.results.identification import Identification
 from sysid.results.parts import SearchEvidence

@@ -14,8 +14,8 @@ from examples.paper.document import (
     format_number,
     to_markdown,
 )
-from service.datasets.schemas import SimulateIn
-from service.jobs.schemas import JobIn
+from service.datasets.dataset_schemas import SimulateIn
+from service.jobs.job_schemas import JobIn
 from sysid.core import text
 from sysid.data.records import Channel
 from sysid.models.catalogue.load import copy_catalogue_document

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.search.archive import make_archive
 from sysid.search.island import Island
 from sysid.search.state import SEARCH_RECORD

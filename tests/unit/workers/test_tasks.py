@@ -15,7 +15,7 @@ from sysid.data.noise import Noise
 from sysid.identification import best_estimate, conclude
 from sysid.identification.identify import identify
 from sysid.identification.run import begin_run
-from sysid.kernels import build, compilation
+from sysid.kernels.compilation import build, limited_compilation
 from sysid.kernels.layout import KernelVariant
 from sysid.models.catalogue.load import copy_catalogue_document
 from sysid.models.model import Model
@@ -74,10 +74,10 @@ def test_a_run_whose_model_needs_too_long_to_compile_fails_alone_with_the_limit(
 ) -> None:
     def compile_one(model: Model, variant: KernelVariant) -> bytes:
         is_costly = model.name == "costly"
-        return (compilation.compile_kernel if is_costly else compile_here)(model, variant)
+        return (limited_compilation.compile_kernel if is_costly else compile_here)(model, variant)
 
     monkeypatch.setattr(build, "compile_kernel", compile_one)
-    monkeypatch.setattr(compilation, "_WALL_SECONDS", 0.05)
+    monkeypatch.setattr(limited_compilation, "_WALL_SECONDS", 0.05)
     whole = spec(1, generations=5)
     costly = {
         **whole.problem.model,

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from service.dispatch.warm_starts import OpenChains
+from service.dispatch.run_warm_starts import OpenChains
 from service.jobs.warm_start_order import ChainLayout
 from tests.support.cluster.small_runs import RECORDS, Notebook, spec
 from tests.unit.workers.test_scheduler import ScriptedExecutor, fails, finish, jobs

@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from service.cli import common, identify, sweeps
+from service.cli import common, identify_command, sweep_command
 from service.cli.common import (
     FieldOrigins,
     file_origins,
@@ -60,13 +60,13 @@ def test_a_terminal_obeys_nothing_in_names_of_others(capsys: pytest.CaptureFixtu
     ],
 )
 def test_a_pointer_is_told_as_the_option_that_gives_it(pointer: str, place: str) -> None:
-    assert sweeps.FIELD_ORIGINS.locate(pointer) == place
+    assert sweep_command.FIELD_ORIGINS.locate(pointer) == place
 
 
 def test_every_field_that_an_option_gives_is_told_at_that_option() -> None:
-    from service.sweeps.schemas import NoiseSweepIn
+    from service.sweeps.sweep_schemas import NoiseSweepIn
 
-    by_options = {place.split("/")[1] for place in sweeps.FIELD_ORIGINS.options}
+    by_options = {place.split("/")[1] for place in sweep_command.FIELD_ORIGINS.options}
     by_set = {
         "hold",
         "parameters",
@@ -104,7 +104,7 @@ def test_all_faults_are_one_line_with_columns_and_without_the_servers_words(
         {"pointer": "", "detail": "whole"},
         {"pointer": "/truth/inputs/u/expression", "column": 3, "detail": "ends"},
     )
-    with pytest.raises(typer.Exit) as ended, report_faults(sweeps.FIELD_ORIGINS):
+    with pytest.raises(typer.Exit) as ended, report_faults(sweep_command.FIELD_ORIGINS):
         raise read_refusal(422, *entries)
     assert ended.value.exit_code == 1
     line = capsys.readouterr().err
@@ -124,7 +124,7 @@ def test_what_is_no_fault_of_the_body_goes_on_as_it_is(error: ProblemError) -> N
 def test_a_number_that_is_none_is_wrong_usage_at_its_option(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    with pytest.raises(typer.Exit) as ended, report_faults(sweeps.FIELD_ORIGINS):
+    with pytest.raises(typer.Exit) as ended, report_faults(sweep_command.FIELD_ORIGINS):
         raise NotFinite("/truth/parameters/K", float("inf"))
     assert ended.value.exit_code == 2
     assert capsys.readouterr().err == "lagid: --true K: found inf; need a finite number\n"
@@ -138,10 +138,10 @@ HELD = "If the input was held, use hold: {u: zero}"
 @pytest.mark.parametrize(
     ("places", "note", "end"),
     [
-        (identify.FIELD_ORIGINS, WHITE, ", use --noise-model ar1"),
-        (identify.FIELD_ORIGINS, HELD, ", use --set hold.u=zero"),
+        (identify_command.FIELD_ORIGINS, WHITE, ", use --noise-model ar1"),
+        (identify_command.FIELD_ORIGINS, HELD, ", use --set hold.u=zero"),
         (FieldOrigins(), WHITE, ", use --set loss.noise_model=ar1"),
-        (identify.FIELD_ORIGINS, MODEL, "needs the model solver: {interpolation: linear}"),
+        (identify_command.FIELD_ORIGINS, MODEL, "needs the model solver: {interpolation: linear}"),
         (FieldOrigins(), "a set {1: 2} of pairs: {a, b}", "a set {1: 2} of pairs: {a, b}"),
     ],
 )

@@ -8,7 +8,7 @@ import pytest
 import typer
 
 from service.cli.common import report_faults, upload_origins
-from service.cli.identify import FileOptions, read_input_file
+from service.cli.identify_command import FileOptions, read_input_file
 from service.client.calls import build_upload, raise_for_problem
 from tests.support.files.experiment_files import TIMES, join_rows, write_parquet
 

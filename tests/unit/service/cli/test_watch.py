@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from service.cli.tables import MAX_WARNING_KINDS, print_reuse_note, print_run_summary
+from service.cli.printed_tables import MAX_WARNING_KINDS, print_reuse_note, print_run_summary
 from service.cli.watch import LOG_INTERVAL_SECONDS, ProgressLog, RunsProgress
 
 

@@ -15,7 +15,7 @@ from unittest.mock import create_autospec
 import httpx
 import pytest
 
-from service.api.write_contract import DOCUMENT_FILE
+from service.api.contract.write_contract import DOCUMENT_FILE
 from service.client import documents
 from service.client.async_client import AsyncClient
 from service.client.calls import ClientError, WaitTimeout, choose_key

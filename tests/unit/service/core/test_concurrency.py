@@ -5,9 +5,9 @@ from threading import BoundedSemaphore, Event, Semaphore
 
 import pytest
 
-from service.core import concurrency
-from service.core.concurrency import ConcurrencyLimit
 from service.core.errors import ServiceBusy
+from service.core.process import concurrency
+from service.core.process.concurrency import ConcurrencyLimit
 from tests.support.limits import LIMIT_SECONDS
 
 

@@ -9,13 +9,13 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import ValidationError
 
-from service.core.derived_bodies import (
+from service.core.bodies.derived_bodies import (
     derive_fields,
     describe_settings,
     read_settings,
     take_setting,
 )
-from service.core.wire import Body
+from service.core.bodies.wire import Body
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import (
     Bounds,
@@ -184,7 +184,9 @@ def test_a_setting_without_a_default_is_needed() -> None:
 
 
 def test_python_without_docstrings_has_bodies_without_descriptions() -> None:
-    code = "from service.jobs.schemas import JobIn; print(JobIn.model_fields['skip'].description)"
+    code = (
+        "from service.jobs.job_schemas import JobIn; print(JobIn.model_fields['skip'].description)"
+    )
     done = subprocess.run(
         [sys.executable, "-OO", "-c", code],
         cwd=ROOT,

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from service.core.errors import Misconfigured
-from service.core.folder_lock import lock_folder
+from service.core.process.folder_lock import lock_folder
 
 HOLD = """
 import pathlib, sys
-from service.core.folder_lock import lock_folder
+from service.core.process.folder_lock import lock_folder
 with lock_folder(pathlib.Path(sys.argv[1]), "") as lock:
     lock.describe_holder("the first")
     print("held", flush=True)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from service.core.logs import (
+from service.core.process.logs import (
     JsonFormatter,
     TextFormatter,
     bind_ids,

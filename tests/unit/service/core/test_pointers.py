@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from service.core.validation import explain_errors
-from service.jobs.schemas import JobIn
+from service.core.bodies.validation import explain_errors
+from service.jobs.job_schemas import JobIn
 from sysid.core.errors import join_pointer, split_pointer
 
 

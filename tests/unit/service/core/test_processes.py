@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import psutil
 import pytest
 
-from service.core.processes import (
+from service.core.process.process_identity import (
     describe_process,
     has_process_ended,
     is_awake,

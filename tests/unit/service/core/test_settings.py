@@ -11,9 +11,9 @@ from pydantic import ValidationError
 
 from service.core.errors import Misconfigured
 from service.core.settings import Settings, is_loopback
-from service.jobs.schemas import JobIn
+from service.jobs.job_schemas import JobIn
 from service.jobs.to_core import RunSettings, read_run_settings
-from service.pages.choices import DEFAULTS, NAMES, TEXTS, list_choices
+from service.pages.forms.choices import DEFAULTS, NAMES, TEXTS, list_choices
 from service.storage.sessions import Database
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import (

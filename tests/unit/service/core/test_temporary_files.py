@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core import temporary_files
+from service.core.process import temporary_files
 from sysid.core import machine
 from tests.support.limits import LIMIT_SECONDS
 from workers import local_ray, ray_folders
@@ -16,7 +16,7 @@ from workers.errors import ClusterUnavailable
 
 LEAVE = """
 import sys
-from service.core import temporary_files
+from service.core.process import temporary_files
 open(sys.argv[1] + temporary_files.make_temporary_prefix(), "w")
 """
 ELSEWHERE = "another boot pid:[4026531836]"

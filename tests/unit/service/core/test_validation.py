@@ -7,8 +7,8 @@ import pytest
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic_core._pydantic_core import list_all_errors
 
-from service.core.validation import PYDANTIC_KINDS, describe_error, explain_errors
-from service.jobs.schemas import JobIn
+from service.core.bodies.validation import PYDANTIC_KINDS, describe_error, explain_errors
+from service.jobs.job_schemas import JobIn
 
 
 def explain_value(kind: Any, value: Any) -> str:

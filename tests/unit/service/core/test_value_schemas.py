@@ -5,8 +5,13 @@ from dataclasses import dataclass
 import pytest
 from pydantic import Field
 
-from service.core.value_schemas import describe_value, extend_by, extend_later_by, read_descriptions
-from service.core.wire import Answer
+from service.core.bodies.value_schemas import (
+    describe_value,
+    extend_by,
+    extend_later_by,
+    read_descriptions,
+)
+from service.core.bodies.wire import Answer
 from sysid.core.types import FloatArray
 from sysid.core.value_documents import encode, has_fields, list_fields
 from sysid.results.result import Result

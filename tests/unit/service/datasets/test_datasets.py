@@ -9,8 +9,8 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import TooLarge
 from service.core.settings import Settings
+from service.datasets.dataset_schemas import BinaryInput, StepInput, WaveInput
 from service.datasets.datasets import check_upload_size, describe_recording
-from service.datasets.schemas import BinaryInput, StepInput, WaveInput
 from service.datasets.signal_channels import map_channels
 from service.datasets.waveforms import InputSignals, interpolate_channel
 from service.storage.objects import FolderStore, StoredObject

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from service.dispatch import checkpoints
 from service.dispatch.checkpoints import UnreadableCheckpoint, pack_state, unpack_state
 from sysid.identification.run import advance_run, begin_run, is_finished
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from tests.support.cluster.small_runs import RECORDS, spec
 from tests.support.library.search_problems import bits
 from workers.protocol import AdvanceRun, RunFailure

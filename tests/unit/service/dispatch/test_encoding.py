@@ -11,7 +11,7 @@ import pytest
 from sqlalchemy.dialects import postgresql
 
 from service.dispatch.encoding import ResultEncoder, write_signals
-from service.formats.mcap import read_fitted_outputs
+from service.formats.mcap.mcap_files import read_fitted_outputs
 from service.queue.packed_results import LAYOUTS, RESULT_ROWS, PackedResults, RowLayout, pack_rows
 from service.queue.run_writes import RunOutcome
 from service.storage.tables import Base

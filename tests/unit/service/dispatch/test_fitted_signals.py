@@ -6,8 +6,8 @@ import pytest
 
 from service.dispatch import fitted_signals
 from service.dispatch.fitted_signals import store_signals
-from service.storage.errors import ObjectStoreFailed
 from service.storage.objects import StoredObject
+from service.storage.storage_errors import ObjectStoreFailed
 
 
 class RecoveringStore:

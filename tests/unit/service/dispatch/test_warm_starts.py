@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.dispatch.warm_starts import MAX_OPEN_CHAINS, OpenChains
+from service.dispatch.run_warm_starts import MAX_OPEN_CHAINS, OpenChains
 from service.jobs.warm_start_order import ChainLayout
 
 SHAPES = st.tuples(st.integers(1, 6), st.integers(1, 6), st.integers(1, 6))

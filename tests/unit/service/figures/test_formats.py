@@ -2,7 +2,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from service.core.text import format_age, format_count, format_duration
+from service.core.label_text import format_age, format_count, format_duration
 from sysid.core.text import format_estimate, format_interval, format_number, format_unit
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from service.figures.simulation import begin_near_step
+from service.figures.simulation_figure import begin_near_step
 from sysid.figures.plotly import Figure
 
 

@@ -1,7 +1,7 @@
 """The figure of a trend: what is drawn, and how laws are written."""
 
-from service.figures.trend import plot_trend, trend_height
-from service.trends.schemas import CoefficientOut, LawOut, PointOut, QuantityOut, TrendOut
+from service.figures.trend_figure import plot_trend, trend_height
+from service.trends.trend_schemas import CoefficientOut, LawOut, PointOut, QuantityOut, TrendOut
 
 
 def find_quantity(name: str, kind: str, laws: list[LawOut]) -> QuantityOut:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.formats.csv_recordings import generate_csv, read_csv
 from service.formats.limits import DEFAULT_LIMITS
+from service.formats.tabular.csv_recordings import generate_csv, read_csv
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
 

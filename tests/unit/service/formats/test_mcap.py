@@ -17,9 +17,9 @@ from mcap.reader import make_reader
 from mcap.records import DataEnd, Footer, McapRecord, Message, MessageIndex, SummaryOffset
 from mcap.stream_reader import StreamReader
 
-from service.formats import mcap_writer
 from service.formats.limits import DEFAULT_LIMITS
-from service.formats.mcap import (
+from service.formats.mcap import mcap_writer
+from service.formats.mcap.mcap_files import (
     FittedInput,
     FittedOutput,
     read_fitted_outputs,

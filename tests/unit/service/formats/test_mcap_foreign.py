@@ -11,8 +11,8 @@ from google.protobuf.message_factory import GetMessageClass
 from mcap.writer import CompressionType
 
 from service.formats.limits import DEFAULT_LIMITS
-from service.formats.mcap import read_mcap_with_notes
-from service.formats.mcap_messages import build_schema
+from service.formats.mcap.mcap_files import read_mcap_with_notes
+from service.formats.mcap.mcap_messages import build_schema
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 from tests.support.files.mcap_files import json_messages, write_foreign_bytes

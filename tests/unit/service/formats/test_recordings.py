@@ -16,14 +16,15 @@ import pandas as pd
 import pytest
 
 import lagid
-from service.formats import csv_recordings, recordings, table_columns
-from service.formats.csv_recordings import read_csv
+from service.formats import recordings
 from service.formats.file_kinds import SUFFIXES, detect_kind
 from service.formats.limits import ReadOptions
 from service.formats.recordings import read_recording, read_with_notes
 from service.formats.sandbox_child import read_file
-from service.formats.table_layout import PEEK_ROWS
-from service.formats.text_files import open_text
+from service.formats.tabular import csv_recordings, table_columns
+from service.formats.tabular.csv_recordings import read_csv
+from service.formats.tabular.table_layout import PEEK_ROWS
+from service.formats.tabular.text_files import open_text
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 from sysid.data.table_rules import ReadingNote

@@ -116,7 +116,7 @@ def test_dates_are_rounded_once() -> None:
 
 
 def test_a_channel_is_named_by_its_column_or_without_the_unit() -> None:
-    from sysid.identification.arguments import read_records
+    from sysid.identification.identify_arguments import read_records
     from sysid.models.catalogue.load import resolve_model
 
     table = pd.DataFrame({"t": TIMES, "u (V)": INPUT, "y": OUTPUT})

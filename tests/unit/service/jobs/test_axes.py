@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.core.json_pointer import build_run_body
+from service.core.bodies.json_pointer import build_run_body
 from service.jobs.axes import (
     SweepCell,
     build_axis_groups,
@@ -15,7 +15,7 @@ from service.jobs.axes import (
     group_axes,
     iterate_cells,
 )
-from service.jobs.schemas import JobIn
+from service.jobs.job_schemas import JobIn
 
 
 def job(*axes: dict[str, Any], **fields: Any) -> JobIn:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from service.datasets.schemas import DeriveIn
-from service.jobs.schemas import JobIn
+from service.datasets.dataset_schemas import DeriveIn
+from service.jobs.job_schemas import JobIn
 from sysid.core.settings import SEARCH_METHODS, TOPOLOGIES
 from sysid.data.derivations import STEPS, derive_recording
 from sysid.data.noise import NOISE_KINDS

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.jobs.axes import build_axis_groups, expand_values, group_axes, iterate_cells
-from service.jobs.schemas import SweepAxisIn
+from service.jobs.job_schemas import SweepAxisIn
 from service.jobs.warm_start_order import ChainLayout
 
 DATA = SweepAxisIn(path="/datasets", values=["a", "b", "c"])

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from service.pages.guides import list_notebooks, make_notebook
-from service.pages.notebooks import to_notebook
+from service.pages.documentation.guides import list_notebooks, make_notebook
+from service.pages.documentation.notebooks import to_notebook
 
 PAGE = """# A page
 

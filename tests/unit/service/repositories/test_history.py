@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.repositories.history import (
+from service.repositories.history_rows import (
     PHASES,
     HistoryPoint,
     MigrantPoint,

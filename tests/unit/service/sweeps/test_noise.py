@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import typer
 
-from service.cli.sweeps import build_sweep_tables, parse_sigma_grid
-from service.figures.noise import QUANTILE_95, noise_group_keys, plot_noise_sweep
-from service.sweeps.cramer_rao import StoredBounds, scale_to_sigma
-from service.sweeps.schemas import GroupOut, ParameterSummaryOut, SummaryOut
+from service.cli.sweep_command import build_sweep_tables, parse_sigma_grid
+from service.figures.noise_figure import QUANTILE_95, noise_group_keys, plot_noise_sweep
+from service.sweeps.group_cramer_rao import StoredBounds, scale_to_sigma
+from service.sweeps.sweep_schemas import GroupOut, ParameterSummaryOut, SummaryOut
 from sysid.figures.theme import SERIES_DASHES
 
 SIGMAS = (0.0, 0.5, 1.0)

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from service.sweeps.reidentify import build_job, sort_batch
-from service.sweeps.schemas import ReidentifyIn
+from service.sweeps.reidentification import build_job, sort_batch
+from service.sweeps.sweep_schemas import ReidentifyIn
 
 ENTRIES = [{"x": x, "datasets": [f"ds_{x:g}"]} for x in (8.0, 2.0, 4.0)]
 

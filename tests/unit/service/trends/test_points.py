@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from service.repositories.trends import TrendRow
+from service.repositories.trend_rows import TrendRow
 from service.trends.points import build_quantities, group_by_label, read_onset_estimates
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.results.result import Agreements

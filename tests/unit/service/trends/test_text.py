@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from service.trends.text import list_notes
+from service.trends.trend_text import list_notes
 
 EMPTY: dict[str, Any] = {"x": "length_m", "quantities": [], "labels": [], "notes": []}
 

@@ -12,7 +12,7 @@ from sysid.control.step_response import StepMetrics, measure_step_response
 from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel
-from sysid.kernels.build import compute_kernel_key
+from sysid.kernels.compilation.build import compute_kernel_key
 from sysid.kernels.layout import KernelVariant
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model

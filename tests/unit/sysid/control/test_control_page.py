@@ -5,7 +5,7 @@ import re
 import pytest
 import yaml
 
-from service.control.schemas import ControlIn, RunSimulationIn
+from service.control.control_schemas import ControlIn, RunSimulationIn
 from tests.support.checkout import ROOT
 
 PAGE = (ROOT / "docs/control.md").read_text(encoding="utf-8")

@@ -13,7 +13,7 @@ from sysid.control.step_response import measure_step_response
 from sysid.core.errors import InvalidSettings
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
-from sysid.kernels.build import compute_kernel_key
+from sysid.kernels.compilation.build import compute_kernel_key
 from sysid.kernels.layout import KernelVariant
 from sysid.models.model import Model
 from sysid.models.parse import parse_model

@@ -8,7 +8,7 @@ import pytest
 from sysid.control.linear_form import IdentifiedModel
 from sysid.control.process_form import recognise_process
 from sysid.models.catalogue.load import load_model
-from sysid.models.catalogue.processes import Process, list_neighbouring_orders
+from sysid.models.catalogue.process_family import Process, list_neighbouring_orders
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 

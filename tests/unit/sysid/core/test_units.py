@@ -20,7 +20,7 @@ from sysid.data.records import Channel, Record, Recording
 from sysid.identification.identify import identify
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
-from sysid.models.units import list_mixed_unit_warnings, list_unknown_unit_warnings
+from sysid.models.unit_checks import list_mixed_unit_warnings, list_unknown_unit_warnings
 
 TINY = GeneticAlgorithm(population=8, generations=2, islands=1)
 

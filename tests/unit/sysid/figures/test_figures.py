@@ -8,7 +8,7 @@ import pytest
 
 from service.figures.csv import to_csv
 from sysid.core.settings import LossKind
-from sysid.figures import plotly, signals
+from sysid.figures import plotly, signal_figures
 from sysid.figures.data import (
     ExperimentTraces,
     OutputTraces,
@@ -186,23 +186,25 @@ def test_the_waterfall_puts_the_best_island_first() -> None:
 
 
 def test_a_response_shows_measured_minus_identified_as_residual() -> None:
-    figure = signals.plot_response(make_experiment(50))
+    figure = signal_figures.plot_response(make_experiment(50))
     assert drawn(figure, "residual")["y"] == [-0.5] * 50
 
 
 def test_every_row_of_a_response_has_the_same_time_axis() -> None:
-    figure = signals.plot_response(make_experiment(50))
+    figure = signal_figures.plot_response(make_experiment(50))
     assert all("xaxis" not in trace for trace in figure["data"])
     assert {trace["yaxis"] for trace in figure["data"]} == {"y", "y2", "y3"}
 
 
 def test_validation_is_shaded_from_its_first_sample_to_the_last() -> None:
-    shape = signals.plot_response(make_experiment(100, since=0.7))["layout"]["shapes"][0]
+    shape = signal_figures.plot_response(make_experiment(100, since=0.7))["layout"]["shapes"][0]
     assert (shape["x0"], shape["x1"]) == (0.7, 0.99)
 
 
 def test_a_record_kept_for_validation_is_shaded_from_its_start() -> None:
-    shape = signals.plot_response(make_experiment(100, since=-math.inf))["layout"]["shapes"][0]
+    shape = signal_figures.plot_response(make_experiment(100, since=-math.inf))["layout"]["shapes"][
+        0
+    ]
     assert shape["x0"] == 0.0
 
 
@@ -213,20 +215,20 @@ def before_record(name: str, known: SignalTrace) -> ExperimentTraces:
 def test_what_an_input_was_before_the_record_is_dotted_as_far_as_a_tenth_of_it() -> None:
     times = np.arange(-50, 0) * 0.01
     record = before_record("u", SignalTrace("u", "V", times, np.cos(times)))
-    trace = drawn(signals.plot_response(record), "u, before the record")
+    trace = drawn(signal_figures.plot_response(record), "u, before the record")
     assert trace["x"] == pytest.approx(times[-9:])
-    assert trace["yaxis"] == drawn(signals.plot_response(record), "u")["yaxis"]
+    assert trace["yaxis"] == drawn(signal_figures.plot_response(record), "u")["yaxis"]
     assert trace["line"]["dash"] == "dot"  # type: ignore[index]
-    whole = drawn(signals.plot_signals(record.inputs), "u, before the record")
+    whole = drawn(signal_figures.plot_signals(record.inputs), "u, before the record")
     assert whole["x"] == pytest.approx(times)
-    names = [one["name"] for one in signals.plot_response(make_experiment(100))["data"]]
+    names = [one["name"] for one in signal_figures.plot_response(make_experiment(100))["data"]]
     assert not any("before the record" in name for name in names)
 
 
 def test_a_long_response_is_thinned_and_a_stretch_of_it_is_not() -> None:
     record = make_experiment(20_000)
-    whole = signals.plot_response(record)
-    part = signals.plot_response(record, 50.0, 53.0)
+    whole = signal_figures.plot_response(record)
+    part = signal_figures.plot_response(record, 50.0, 53.0)
     assert all(len(trace["x"]) <= MAX_POINTS for trace in whole["data"])
     assert whole["layout"]["meta"]["thinned"]
     inside = [x for x in drawn(part, "measured")["x"] if 50.0 <= x <= 53.0]
@@ -236,27 +238,27 @@ def test_a_long_response_is_thinned_and_a_stretch_of_it_is_not() -> None:
 def test_pooled_samples_are_drawn_as_points() -> None:
     times = np.repeat(np.arange(500) * 0.01, 4)
     output = OutputTraces(SignalTrace("y", "1", times, times), times)
-    figure = signals.plot_response(ExperimentTraces("record 1", (output,), ()))
+    figure = signal_figures.plot_response(ExperimentTraces("record 1", (output,), ()))
     assert drawn(figure, "measured")["mode"] == "markers"
 
 
 def test_the_heights_that_a_page_reserves_are_those_of_the_figures() -> None:
-    assert signals.plot_response(make_experiment(9))["layout"]["height"] == signals.response_height(
-        1, 1
-    )
-    assert signals.plot_signals([make_signal(9), make_signal(9)])["layout"][
+    assert signal_figures.plot_response(make_experiment(9))["layout"][
         "height"
-    ] == signals.signals_height(2)
+    ] == signal_figures.response_height(1, 1)
+    assert signal_figures.plot_signals([make_signal(9), make_signal(9)])["layout"][
+        "height"
+    ] == signal_figures.signals_height(2)
     assert plotly.plot_convergence(run(), 3)["layout"]["height"] == plotly.convergence_height(1, 3)
     assert plotly.plot_correlation(CORRELATION)["layout"]["height"] == plotly.correlation_height(2)
 
 
 def test_the_numbers_of_a_figure_are_one_row_each_in_csv() -> None:
-    lines = to_csv(signals.plot_signals([make_signal(3, "a,b")])).splitlines()
+    lines = to_csv(signal_figures.plot_signals([make_signal(3, "a,b")])).splitlines()
     assert lines[0] == "series,x,y"
     assert lines[1:3] == ['"a,b",0.0,0.0', '"a,b",0.01,0.009999833']
     assert to_csv(plotly.plot_correlation(CORRELATION)).splitlines()[2] == ",L,T,-0.7"
-    line = to_csv(signals.plot_signals([make_signal(3, "=1+1")])).splitlines()[1]
+    line = to_csv(signal_figures.plot_signals([make_signal(3, "=1+1")])).splitlines()[1]
     assert line.startswith("'=1+1")  # no formula in a spreadsheet
 
 

@@ -6,7 +6,7 @@ import pytest
 from service.figures.csv import to_csv
 from sysid.figures.data import Floats
 from sysid.figures.plotly import Figure
-from sysid.figures.posterior import (
+from sysid.figures.posterior_figures import (
     MAX_SHOWN,
     Corner,
     choose_shown,

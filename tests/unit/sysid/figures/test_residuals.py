@@ -13,7 +13,7 @@ from service.pages.render import template_environment
 from service.pages.result_filters import describe_onset, format_excess_bic, format_onset_text
 from sysid.core.text import format_p_value
 from sysid.figures.data import CorrelationTrace
-from sysid.figures.residuals import plot_residuals, residuals_height
+from sysid.figures.residual_figures import plot_residuals, residuals_height
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import ResidualTest, ResidualTests
 from sysid.results.parts import OrderComparison, OrderFit

@@ -14,8 +14,8 @@ from sysid.figures.data import (
     SignalTrace,
 )
 from sysid.figures.plotly import Figure
-from sysid.figures.residuals import plot_residuals
-from sysid.figures.signals import plot_response
+from sysid.figures.residual_figures import plot_residuals
+from sysid.figures.signal_figures import plot_response
 from sysid.figures.stack import stack_figures
 from sysid.search.state import IslandSummary
 from sysid.uncertainty.estimates import CorrelationMatrix

@@ -8,7 +8,7 @@ import pytest
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identifiability.combinations import IdentifiableCombination
-from sysid.identifiability.scaling import find_scalings
+from sysid.identifiability.scaling_symmetries import find_scalings
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem

@@ -9,7 +9,7 @@ from sysid.core.settings import GeneticAlgorithm, Migration, Stop
 from sysid.identification.conclude import conclude_run
 from sysid.identification.run import advance_run, begin_run
 from sysid.islands.archipelago import create_islands
-from sysid.islands.state import RunState
+from sysid.islands.run_state import RunState
 from sysid.islands.stopping import count_restarts, has_search_ended, make_stopping_rule
 from sysid.models.catalogue.load import load_model
 from sysid.search.state import SEARCH_RECORD, Improvement, SearchArray

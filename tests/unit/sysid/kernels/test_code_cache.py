@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sysid.core import code_cache
-from sysid.kernels import build
+from sysid.kernels.compilation import build
 from sysid.kernels.layout import KernelVariant
 from sysid.models.model import Model
 from sysid.simulation.problem import Problem

@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 
 from sysid.core.errors import InvalidModel
-from sysid.kernels import build, compilation
-from sysid.kernels.compilation import compile_kernel
-from sysid.kernels.compile_task import CompileTask, decode_task, encode_task
+from sysid.kernels.compilation import build, limited_compilation
+from sysid.kernels.compilation.compile_task import CompileTask, decode_task, encode_task
+from sysid.kernels.compilation.limited_compilation import compile_kernel
+from sysid.kernels.compilation.machine_code import compile_assembly
 from sysid.kernels.kernel import emit_kernel
 from sysid.kernels.layout import KernelVariant
-from sysid.kernels.machine_code import compile_assembly
 from sysid.models.catalogue.load import catalogue, load_model
 from sysid.models.model import Model
 from tests.support.library.small_models import differential, duffing
@@ -42,11 +42,11 @@ def test_the_child_compiles_the_same_code_and_imports_nothing_of_the_working_fol
 def test_the_time_of_a_compilation_is_told_to_the_operator(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    before = compilation.get_compile_seconds()
-    monkeypatch.setattr(compilation, "_WALL_SECONDS", 0.01)
+    before = limited_compilation.get_compile_seconds()
+    monkeypatch.setattr(limited_compilation, "_WALL_SECONDS", 0.01)
     with pytest.raises(InvalidModel):
         compile_kernel(duffing(), VARIANT)
-    assert compilation.get_compile_seconds() >= before + 0.01
+    assert limited_compilation.get_compile_seconds() >= before + 0.01
 
 
 @pytest.mark.parametrize("name", catalogue())
@@ -68,14 +68,14 @@ def test_the_task_of_the_child_has_all_that_a_kernel_depends_on(name: str) -> No
 def test_a_model_beyond_a_limit_of_time_is_refused_with_the_limit(
     monkeypatch: pytest.MonkeyPatch, limit: str, value: float, told: str
 ) -> None:
-    monkeypatch.setattr(compilation, limit, value)
+    monkeypatch.setattr(limited_compilation, limit, value)
     assert told in refuse_model(duffing())
 
 
 def test_a_model_beyond_the_limit_of_memory_is_refused_with_the_limit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(compilation, "MEMORY_BYTES", 200 * 1024**2)
+    monkeypatch.setattr(limited_compilation, "MEMORY_BYTES", 200 * 1024**2)
     assert "more than 200 MiB of memory" in refuse_model(large_model())
 
 
@@ -93,7 +93,7 @@ def test_what_was_refused_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) ->
 
     def refuse(model: Model, variant: KernelVariant) -> bytes:
         calls.append(model)
-        raise compilation._build_error("1 s")
+        raise limited_compilation._build_error("1 s")
 
     monkeypatch.setattr(build, "_refused_kernels", {})
     monkeypatch.setattr(build, "load_code", lambda key: None)
@@ -106,6 +106,6 @@ def test_what_was_refused_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_an_error_of_the_child_is_no_fault_of_the_model(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compilation, "encode_task", lambda task: b"no task")
+    monkeypatch.setattr(limited_compilation, "encode_task", lambda task: b"no task")
     with pytest.raises(RuntimeError, match="JSONDecodeError"):
         compile_kernel(duffing(), VARIANT)

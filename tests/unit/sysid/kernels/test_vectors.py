@@ -10,7 +10,8 @@ from scipy.interpolate import PchipInterpolator
 from sysid import load_model
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.kernels import machine_code, vectors
+from sysid.kernels import vectors
+from sysid.kernels.compilation import machine_code
 from sysid.kernels.vectors import VectorFunctions, load_vector_functions
 from sysid.simulation.problem import Problem
 

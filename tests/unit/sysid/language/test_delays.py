@@ -3,10 +3,10 @@
 import pytest
 
 from sysid.language.checker import check_expression
-from sysid.language.intervals import bound_expression
 from sysid.language.printer import format_expression
 from sysid.language.scope import Scope
 from sysid.language.tree import Binary, Number, PastValue, Symbol
+from sysid.language.value_intervals import bound_expression
 
 L, D, H = Symbol("L", "parameter"), Symbol("d", "parameter"), Symbol("h", "period")
 SAMPLES = Binary("/", L, H)

@@ -6,11 +6,11 @@ import pytest
 
 from sysid.language.checker import check_expression
 from sysid.language.evaluation import evaluate_expression
-from sysid.language.intervals import bound_expression
 from sysid.language.printer import format_expression
 from sysid.language.scope import Scope
 from sysid.language.transform import add_delays, shift_expression
 from sysid.language.tree import Expression
+from sysid.language.value_intervals import bound_expression
 
 PARAMETERS = {
     "a": (-2.0, 3.0),

@@ -9,8 +9,8 @@ import pytest
 from sysid.core.errors import InvalidModel, InvalidSettings, UnknownModel
 from sysid.models import catalogue as folder
 from sysid.models.catalogue.load import catalogue, copy_catalogue_document, load_model
-from sysid.models.delays import check_delays
-from sysid.models.documents import MAX_DOCUMENT_CHARACTERS, parse_yaml
+from sysid.models.document_reader import MAX_DOCUMENT_CHARACTERS, parse_yaml
+from sysid.models.model_delays import check_delays
 from sysid.models.parameters import override_parameters
 from sysid.models.parse import parse_model
 from tests.support.library.expression_values import simulate

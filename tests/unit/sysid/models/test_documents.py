@@ -7,7 +7,7 @@ import pytest
 from sysid.core.errors import InvalidModel
 from sysid.language.checker import MAX_NODES
 from sysid.language.tree import PastValue
-from sysid.models.documents import MAX_EXPRESSION_CHARACTERS, parse_yaml
+from sysid.models.document_reader import MAX_EXPRESSION_CHARACTERS, parse_yaml
 from sysid.models.model import EstimatedInitial, FixedInitial, MeasuredInitial, ModelSignal, Solver
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.parse import parse_model

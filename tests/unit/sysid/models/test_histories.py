@@ -12,7 +12,7 @@ from sysid.control.controllers import PidControl
 from sysid.core.errors import InvalidModel, RecordTooShort
 from sysid.data.records import Channel, Record
 from sysid.identifiability.bound_limits import find_widest_bounds
-from sysid.identifiability.scaling import find_scalings
+from sysid.identifiability.scaling_symmetries import find_scalings
 from sysid.models.model import DerivedInitial, EstimatedInitial, FixedInitial, Model
 from sysid.models.parse import parse_model
 from sysid.models.unused import find_unused_names

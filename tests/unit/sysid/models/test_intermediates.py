@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sysid.core.errors import InvalidModel
-from sysid.kernels.compile_task import CompileTask, decode_task, encode_task
+from sysid.kernels.compilation.compile_task import CompileTask, decode_task, encode_task
+from sysid.kernels.compilation.machine_code import optimize_assembly
 from sysid.kernels.kernel import emit_kernel
 from sysid.kernels.layout import KernelVariant
-from sysid.kernels.machine_code import optimize_assembly
 from sysid.models.parse import parse_model
 from sysid.models.unused import find_unused_names
 from sysid.simulation.problem import Problem

@@ -3,7 +3,7 @@
 import re
 
 from sysid.language.functions import FUNCTIONS
-from sysid.models.documents import parse_yaml
+from sysid.models.document_reader import parse_yaml
 from sysid.models.parse import parse_model
 from tests.support.checkout import ROOT
 

@@ -7,14 +7,14 @@ import pytest
 
 from sysid.core.errors import InvalidBounds, InvalidSettings, RecordTooShort
 from sysid.data.records import Channel, Record
-from sysid.models.delays import (
+from sysid.models.model import build_initial_parameters
+from sysid.models.model_delays import (
     check_delays,
     check_record_length,
     compute_longest_delay,
     find_unused_settings,
     list_past_values,
 )
-from sysid.models.model import build_initial_parameters
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.ties import apply_ties, resolve_ties
 from sysid.simulation.problem import Problem

@@ -9,7 +9,7 @@ import pytest
 from sysid.core.errors import InvalidModel
 from sysid.core.settings import GeneticAlgorithm
 from sysid.data.records import Channel, Record
-from sysid.identifiability.scaling import find_scalings
+from sysid.identifiability.scaling_symmetries import find_scalings
 from sysid.identification.identify import identify
 from sysid.models.model import DerivedInitial, Model
 from sysid.models.parse import parse_model

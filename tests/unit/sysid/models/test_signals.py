@@ -6,7 +6,7 @@ import pytest
 from sysid.core.errors import InvalidRecord, InvalidSettings, UnknownModel
 from sysid.data.records import Channel, Record, Recording
 from sysid.models.catalogue.load import load_model, resolve_model
-from sysid.models.signals import assign_channels, assign_record, assign_recording
+from sysid.models.channel_assignment import assign_channels, assign_record, assign_recording
 
 MODEL = load_model("fopdt")
 T = np.arange(3.0)

@@ -11,7 +11,7 @@ from sysid.identification.identify import identify
 from sysid.models.catalogue.load import catalogue, load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
-from sysid.models.units import list_time_unit_warnings
+from sysid.models.unit_checks import list_time_unit_warnings
 
 
 def build_model(equation: str, unit: str, **fields: Any) -> Model:

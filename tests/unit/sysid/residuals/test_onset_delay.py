@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.formats.csv_recordings import read_csv
+from service.formats.tabular.csv_recordings import read_csv
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold, Record
 from sysid.models.catalogue.load import load_model

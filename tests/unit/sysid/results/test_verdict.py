@@ -8,7 +8,7 @@ import pytest
 from sysid.residuals.residual_tests import ResidualTest
 from sysid.results.parts import OrderComparison, OrderFit, SearchEvidence, compare_fits
 from sysid.results.verdict import Evidence, judge_result
-from sysid.simulation.metrics import ChannelMetrics
+from sysid.simulation.fit_metrics import ChannelMetrics
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
 
 

@@ -1,0 +1,137 @@
+"""What holds for every request and answer: who may ask, the size of a body, and headers.
+
+FastAPI reads a whole body before it parses it, so the limit must apply while it is received.
+Uploads have a separate limit.
+"""
+
+import re
+from collections.abc import Mapping
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.api.requests.problems import error_response
+from service.api.requests.request_root_path import get_service_path
+from service.core.bodies.text_checks import parse_digits
+from service.core.errors import ForeignOrigin, MisdirectedRequest, TooLarge
+from service.core.settings import Settings
+
+UPLOAD_ROUTE = ("POST", "/v1/datasets")
+"""The upload goes to a file while it arrives (`service.api.content`)."""
+
+
+class BodyLimit:
+    """Middleware that refuses a body of more than `limit` bytes.
+
+    A body that is announced as longer is not read at all. Any other body is read up to the limit.
+    """
+
+    def __init__(self, app: ASGIApp, limit: int) -> None:
+        self._app, self._limit = app, limit
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on and count the bytes of its body."""
+        if scope["type"] != "http" or (scope["method"], get_service_path(scope)) == UPLOAD_ROUTE:
+            await self._app(scope, receive, send)
+        else:
+            await self._app(scope, self._limit_receive(scope, receive), send)
+
+    def _limit_receive(self, scope: Scope, receive: Receive) -> Receive:
+        announced = Headers(scope=scope).get("content-length", "")
+        size = 0
+
+        async def receive_counted() -> Message:
+            nonlocal size
+            if announced.isdecimal():
+                self._check_size(parse_digits(announced), "")
+            message = await receive()
+            size += len(message.get("body", b""))
+            self._check_size(size, " or more")
+            return message
+
+        return receive_counted
+
+    def _check_size(self, size: int, suffix: str) -> None:
+        if size > self._limit:
+            raise TooLarge(
+                f"the body has {size} bytes{suffix}; at most {self._limit} are allowed "
+                "(LAGID_MAX_BODY_BYTES)"
+            )
+
+
+SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
+FOREIGN_SITES = ("cross-site", "same-site")
+_AUTHORITY = re.compile(r"(\[[0-9a-f:.]+\]|[^\s\[\]:/@]+)(:[0-9]{0,5})?")
+
+
+class OriginCheck:
+    """Middleware that refuses requests of web pages that are not the service's own.
+
+    Any page that a user visits can reach a service on loopback. It may use a name of its own that
+    resolves to 127.0.0.1 (DNS rebinding), or send a request whose answer it cannot read. So `Host`
+    must be a name of the service. A request that changes something must not come from a page of
+    another origin. Programs send no `Origin`, and nothing else is asked of them.
+    """
+
+    def __init__(self, app: ASGIApp, settings: Settings) -> None:
+        self._app, self._settings = app, settings
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, or refuse it before anything of it is read."""
+        if scope["type"] == "http":
+            try:
+                self._check(scope["method"], Headers(scope=scope))
+            except (MisdirectedRequest, ForeignOrigin) as error:
+                await error_response(Request(scope), error)(scope, receive, send)
+                return
+        await self._app(scope, receive, send)
+
+    def _check(self, method: str, headers: Headers) -> None:
+        hosts = headers.getlist("host")  # none in HTTP/1.0, which no browser speaks
+        for host in hosts:
+            if not self._settings.is_served_host(_parse_name(host)):
+                raise MisdirectedRequest(
+                    f"the host {host!r} is none of this service's names. Use its address, or add "
+                    "the name to LAGID_ALLOWED_HOSTS."
+                )
+        if method in SAFE_METHODS:
+            return
+        if headers.get("sec-fetch-site") in FOREIGN_SITES:
+            raise ForeignOrigin("a page of another site sent this request")
+        for origin in headers.getlist("origin"):
+            if not self._is_own_origin(origin, hosts):
+                raise ForeignOrigin(
+                    f"a page of {origin!r} sent this request. If that is the address of this "
+                    "service behind a proxy, add its host to LAGID_ALLOWED_HOSTS."
+                )
+
+    def _is_own_origin(self, origin: str, hosts: list[str]) -> bool:
+        authority = origin.lower().partition("://")[2]
+        is_same = authority != "" and authority in map(str.lower, hosts)
+        return is_same or _parse_name(authority) in self._settings.allowed_hosts
+
+
+def _parse_name(authority: str) -> str:
+    """Return the host of ``host:port`` in lower case, without brackets; empty if there is none."""
+    match = _AUTHORITY.fullmatch(authority.strip().lower())
+    return match[1].strip("[]").removesuffix(".") if match else ""
+
+
+class ResponseHeaders:
+    """Middleware that adds headers to every answer that does not have its own."""
+
+    def __init__(self, app: ASGIApp, headers: Mapping[str, str]) -> None:
+        self._app, self._headers = app, headers
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on and add to the head of its answer."""
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in self._headers.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        await self._app(scope, receive, send_with_headers)

@@ -1,0 +1,1 @@
+"""Bodies and answers: wire types, JSON, pointers, and the messages of faults."""

@@ -1,0 +1,1 @@
+"""MCAP files: written, read within limits, and their layout."""

@@ -1,0 +1,1 @@
+"""Tables: text, sheets and columns, from bytes to channels."""

@@ -1,0 +1,1 @@
+"""The documentation that a server shows, as pages and as notebooks."""

@@ -1,0 +1,1 @@
+"""Forms: their choices, proposed bounds, and the bodies that they become."""

@@ -1,0 +1,1 @@
+"""Reports: one HTML file of a job, or of an identification of this process."""

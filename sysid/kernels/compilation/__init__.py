@@ -1,0 +1,1 @@
+"""From a model to loaded machine code, compiled in a child with limits."""

@@ -1,0 +1,1 @@
+"""Signals of a kernel: states, inputs, and reads of their past."""
