@@ -1,4 +1,6 @@
-"""Guess the layout of a table from its first rows: header, units, separator, decimal sign, roles.
+"""Guess the layout of a table from its first rows: header, units, separator, roles.
+
+The decimal sign follows from the body (`service.formats.tabular.table_columns`).
 
 The longest run of rows of one width that hold numbers or time stamps is the data. The header is
 the last row of that width before them; a row of units may lie between. Lines before the header are
