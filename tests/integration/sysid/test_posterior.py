@@ -52,4 +52,4 @@ def test_the_lag_of_a_tube_of_3_m_is_known_better_than_its_standard_error_says()
     assert "K is from" not in told
     samples = found.posterior.samples
     assert np.all(samples[:, 1:] >= [0.001, 0.0])  # T and L inside their bounds
-    assert found.posterior.correlation[1, 2] < -0.5
+    assert found.posterior.correlation.matrix[1, 2] < -0.5

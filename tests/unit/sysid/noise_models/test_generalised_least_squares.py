@@ -259,7 +259,7 @@ def test_what_a_noise_model_cannot_do_is_refused() -> None:
         Loss("soft-l1", 0.1, "ar1")
     with pytest.raises(InvalidSettings, match="auto, white or ar1"):
         Loss(noise_model="pink")  # type: ignore[arg-type]
-    with pytest.raises(InvalidSettings, match="for free runs"):
+    with pytest.raises(InvalidSettings, match="one-step predictions already contain the noise"):
         Problem.build(load_model(GAIN), [make_record(1)], loss=AR1, prediction="one-step")
     with pytest.raises(InvalidSettings, match="profiles are of plain squares"):
         compute_profile(build_problem(make_record(1)), np.array([2.0, 1.0]), "g")
