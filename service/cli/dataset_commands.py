@@ -184,11 +184,16 @@ def download_dataset(
         ),
     ] = None,
     format: Annotated[
-        Literal["mcap", "csv"], typer.Option(help="MCAP keeps units, holds and segments.")
-    ] = "mcap",
+        Literal["mcap", "csv"] | None,
+        typer.Option(
+            help="Default: as the file's name says, else MCAP, which keeps units and holds."
+        ),
+    ] = None,
     force: Force = False,
 ) -> None:
     """Download a recording."""
+    if format is None:
+        format = "csv" if file is not None and file.suffix.lower() == ".csv" else "mcap"
     found = find_dataset(client, dataset)
     if file == STANDARD_INPUT:
         _write_pieces(client.download(found["id"], format), sys.stdout.buffer)

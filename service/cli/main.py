@@ -88,7 +88,11 @@ _PANELS: Mapping[str, Mapping[str, tuple[Callable[..., None] | str, *tuple[str, 
             "lagid submit job.yaml --wait",
             "lagid submit - --json < job.yaml",
         ),
-        "watch": ("job_commands:watch_job", "lagid watch job_1", "lagid watch job_1 --quiet --json"),
+        "watch": (
+            "job_commands:watch_job",
+            "lagid watch job_1",
+            "lagid watch job_1 --quiet --json",
+        ),
         "jobs": (
             "job_commands:list_jobs",
             "lagid jobs --state running",
@@ -123,7 +127,11 @@ _PANELS: Mapping[str, Mapping[str, tuple[Callable[..., None] | str, *tuple[str, 
         "dispatcher": ("server_processes:run_dispatcher", "lagid dispatcher --cpus 8"),
         "key": ("access_commands:key_app",),
         "project": ("access_commands:project_app",),
-        "audit": ("access_commands:list_audit_log", "lagid audit", "lagid audit --project tubes --json"),
+        "audit": (
+            "access_commands:list_audit_log",
+            "lagid audit",
+            "lagid audit --project tubes --json",
+        ),
         "backup": ("backup_commands:write_backup", "lagid backup lagid.zip"),
         "restore": (
             "backup_commands:restore_backup",
@@ -209,8 +217,8 @@ def main() -> None:
 
 def _usage_message(error: TyperException) -> str:
     """Describe wrong arguments in our own words; empty after a help text."""
-    text = error.format_message()
-    if not text.strip() or "\n" in text.strip():  # no arguments: the help was printed
+    text = " ".join(error.format_message().split())
+    if not text:  # the help was printed
         return ""
     cause: Any = error.__cause__
     if hasattr(cause, "errors"):  # from Pydantic, which reads the values of options

@@ -136,6 +136,8 @@ def test_a_dataset_is_downloaded_and_no_file_is_overwritten(ask: Ask, tmp_path: 
     assert ask("dataset", "download", "steps", "--format", "csv").stdout == "steps.csv\n"
     text = (tmp_path / "steps.csv").read_text()
     assert text == ask("dataset", "download", "steps", "--format", "csv", "-o", "-").stdout
+    assert ask("dataset", "download", "steps", "-o", "by-name.csv").code == 0
+    assert (tmp_path / "by-name.csv").read_text() == text
     assert text.splitlines()[0].startswith("t")
     (tmp_path / "steps.csv").write_text("mine")
     line = check_refusal(ask("dataset", "download", "steps", "--format", "csv"))

@@ -138,6 +138,11 @@ def test_a_file_after_json_is_refused_with_the_option_that_writes_it() -> None:
     assert "--json" not in line
 
 
+def test_a_missing_choice_is_told_with_the_choices() -> None:
+    line = check_refusal(run_lagid("health"), 2)
+    assert "Choose from: web, dispatcher, ray (lagid health --help)" in line
+
+
 def test_the_version_is_printed_alone() -> None:
     printed = run_lagid("--version")
     assert re.fullmatch(r"lagid \d+\.\d+\.\d+\S*\n", printed.stdout)
