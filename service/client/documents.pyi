@@ -429,11 +429,11 @@ class CriteriaDocument(TypedDict):
     """Information criteria, smaller is better; compare only models of the same samples."""
 
     aic: float | None
-    """akaike's criterion; minus infinity where the residuals vanish"""
+    """criterion of Akaike; minus infinity where the residuals vanish"""
     aicc: float | None
     """the same, corrected for few samples; missing if there are not more than κ + 1"""
     bic: float | None
-    """schwarz's criterion; minus infinity where the residuals vanish"""
+    """criterion of Schwarz; minus infinity where the residuals vanish"""
     samples: int
     """number n of scored samples"""
     parameters: int
@@ -1175,7 +1175,7 @@ class OrderFitDocument(TypedDict):
     rms: float | None
     """RMS error, in the unit of the result's `rms`"""
     bic: float | None
-    """schwarz's criterion, smaller is better; with the noise model of the comparison"""
+    """criterion of Schwarz, smaller is better; with the noise model of the comparison"""
     is_open: bool
     """whether its BIC is within 6 of the lowest: no strong evidence against it"""
 

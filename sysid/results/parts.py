@@ -125,7 +125,7 @@ class OrderFit:
     rms : float
         RMS error, in the unit of the result's `rms`.
     bic : float
-        Schwarz's criterion, smaller is better; with the noise model of the comparison.
+        Criterion of Schwarz, smaller is better; with the noise model of the comparison.
     is_open : bool
         Whether its BIC is within 6 of the lowest: no strong evidence against it.
     """

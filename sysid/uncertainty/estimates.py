@@ -85,11 +85,11 @@ class Criteria:
     Attributes
     ----------
     aic : float
-        Akaike's criterion; minus infinity where the residuals vanish.
+        Criterion of Akaike; minus infinity where the residuals vanish.
     aicc : float or None
         The same, corrected for few samples; missing if there are not more than κ + 1.
     bic : float
-        Schwarz's criterion; minus infinity where the residuals vanish.
+        Criterion of Schwarz; minus infinity where the residuals vanish.
     samples : int
         Number n of scored samples.
     parameters : int

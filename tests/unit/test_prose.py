@@ -16,6 +16,11 @@ DOCUMENTS = sorted(
     if not {"notes", "reference"} & set(path.parts)  # the reference is made from other texts
 )
 
+PROGRAM_FOLDERS = ("benchmarks", "examples", "service", "sysid", "tests", "workers")
+FOLDERS = (*PROGRAM_FOLDERS, ".ci", "docker", "docs", "lagid", "migrations")
+MODULES = {path.name for path in list_modules(PROGRAM_FOLDERS)}
+RECORDS = {ROOT / "CHANGELOG.md", *(ROOT / "docs/decisions").iterdir()}  # of their time
+
 
 def split_sentences(markdown: str, ends: str = ".!?:") -> list[str]:
     """Sentences of prose: without code, tables and headings; an entry of a list is one."""
@@ -59,6 +64,49 @@ def list_long_sentences(path: Path) -> Iterator[str]:
     yield from (f"{name}: {one}" for one in long)
     if short and (mean := sum(len(one.split()) for one in short) / len(short)) > MEAN_WORDS:
         yield f"{name}: {mean:.1f} words a sentence"
+
+
+def list_missing_paths(markdown: str) -> Iterator[str]:
+    """List paths, files and modules of the repository that a text names and that do not exist."""
+    prose = re.sub(r"```.*?```", "", markdown, flags=re.DOTALL)
+    for word in " ".join(re.findall(r"`([^`\n]+)`", prose)).split():
+        if re.fullmatch(rf"(?:{'|'.join(map(re.escape, FOLDERS))})/[\w./*-]*", word):
+            exists = any(ROOT.glob(word))
+        elif re.fullmatch(r"\w+\.py", word):  # "beside it"
+            exists = word in MODULES
+        elif module := re.fullmatch(
+            rf"((?:{'|'.join(PROGRAM_FOLDERS)})(?:\.[a-z]\w*)+):?\w*", word
+        ):
+            path = ROOT / module[1].replace(".", "/")
+            exists = path.is_dir() or path.with_suffix(".py").exists()
+        else:
+            continue
+        if not exists:
+            yield word
+
+
+def test_a_path_that_does_not_exist_is_seen() -> None:
+    right = (
+        "`sysid/core/settings.py` `settings.py` `docs/*.md` `python -m benchmarks.fuzz` `a/b.py`"
+    )
+    wrong = "`sysid/settings.py` `no_such.py` `docs/*/none.md` `python -m benchmarks.none`"
+    assert list(list_missing_paths(right)) == []
+    assert list(list_missing_paths(wrong)) == [
+        "sysid/settings.py",
+        "no_such.py",
+        "docs/*/none.md",
+        "benchmarks.none",
+    ]
+
+
+def test_paths_that_documents_name_exist() -> None:
+    missing = [
+        f"{path.relative_to(ROOT)}: {word}"
+        for path in DOCUMENTS
+        if path not in RECORDS
+        for word in list_missing_paths(path.read_text(encoding="utf-8"))
+    ]
+    assert missing == []
 
 
 def test_sentences_of_messages_are_short() -> None:
