@@ -297,7 +297,7 @@ class ComparedValueDocument(TypedDict):
     run: str
     """identifier of the run"""
     name: str
-    """name of the parameter, or of an initial state such as ``x(0)``"""
+    """name of the parameter, or of an initial state such as `x(0)`"""
     unit: str
     """unit of its values"""
     value: float | None
@@ -533,7 +533,7 @@ class EstimateDocument(TypedDict):
     """One parameter's estimate."""
 
     name: str
-    """name of the parameter, or of an initial state such as ``x(0)``"""
+    """name of the parameter, or of an initial state such as `x(0)`"""
     unit: str
     """unit of its values"""
     value: float | None
@@ -711,19 +711,19 @@ class IdentifiableCombinationDocument(TypedDict):
     members: list[str]
     """names of the parameters of the combination"""
     expression: str
-    """A product of powers, such as ``A_m*k_b/J``, or else a sum, such as ``T + L``"""
+    """A product of powers, such as `A_m*k_b/J`, or else a sum, such as `T + L`"""
     value: float | None
     """estimate of the combination; its unit follows from its parameters"""
     stderr: float | None
     """standard error of `value`, in the same unit"""
     is_local: bool
-    """whether the combination holds near the estimate only, as a sum in place of ``K*exp(-E/300)``"""
+    """whether the combination holds near the estimate only, as a sum in place of `K*exp(-E/300)`"""
 
 class IdentifiedValueDocument(TypedDict):
     """Value of one parameter or initial state, estimated or given."""
 
     name: str
-    """name of the parameter, or of the initial state as ``x(0)``"""
+    """name of the parameter, or of the initial state as `x(0)`"""
     value: float | None
     """value, in `unit`"""
     unit: str

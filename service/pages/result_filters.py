@@ -17,14 +17,9 @@ from sysid.models.equation_display import format_equations
 from sysid.models.model import Model
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import ResidualTest
-from sysid.results.parts import OrderComparison, OrderFit, SearchEvidence
+from sysid.results.parts import OrderComparison, OrderFit
+from sysid.results.summary import describe_search
 from sysid.uncertainty.estimates import Estimate, PosteriorParameter
-
-_BECAUSE = {
-    "starts": "settled",
-    "residuals": "settled, as nothing but noise is left",
-    None: "not settled",
-}
 
 
 def format_value_text(estimate: Estimate) -> str:
@@ -96,12 +91,6 @@ def describe_group(group: IdentifiableCombination) -> str:
     return f"{group.expression} = {join_estimate(group.value, group.stderr)}{where}"
 
 
-def describe_settling(search: SearchEvidence) -> str:
-    """Describe how far the search is to be trusted."""
-    starts = f"{search.agreeing_starts} of {search.independent_starts}"
-    return f"{_BECAUSE[search.because]}; {starts} independent starts ended here"
-
-
 def format_delay_text(fit: OrderFit, unit: str) -> str:
     """Format the dead time of an order with its unit."""
     return join_estimate(fit.delay, fit.delay_stderr) + plain_unit(unit)
@@ -131,7 +120,7 @@ RESULT_FILTERS = {
     "onset_text": format_onset_text,
     "onset_note": describe_onset,
     "group_text": describe_group,
-    "search_text": describe_settling,
+    "search_text": describe_search,
     "delay_text": format_delay_text,
     "excess_bic": format_excess_bic,
     "equations": list_equations,

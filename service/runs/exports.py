@@ -88,7 +88,7 @@ def write_estimates(session: Session, run_id: str) -> str:
 
 
 def _list_columns() -> dict[str, str]:
-    """List the columns of the estimates, each with its field: those of old first, then all others.
+    """List the columns of the estimates with their fields: the named ones first, then the others.
 
     The interval is two columns.
     """

@@ -9,7 +9,7 @@ from typing import Any
 def put_off_imports(package: dict[str, Any]) -> None:
     """Import the public names of a package when they are used, each from its own module.
 
-    They are those of the block ``if TYPE_CHECKING:`` of the package's source, so that type checkers
+    They stand in the block ``if TYPE_CHECKING:`` of the package's source. So type checkers
     and editors read plain imports, and a name stands once. A star stands for the public names of a
     package that does the same. SPEC 1 of Scientific Python does so with a stub.
 

@@ -18,9 +18,10 @@ from sysid.results.result import FullResult
 
 SavedResult = TypeVar("SavedResult", bound=FullResult)
 
-FORMAT = "lagid-identification/1"
+FORMAT = "lagid-identification/2"
 _OTHER_FORMATS = {
     "lagid-model/1": "it is an exported model; read it with load_identified",
+    "lagid-identification/1": "a build before 0.1.0 saved it; identify and save anew",
 }
 
 

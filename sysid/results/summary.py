@@ -117,11 +117,8 @@ def describe_residuals(tests: ResidualTests) -> str:
 
 def describe_search(evidence: SearchEvidence) -> str:
     """Say whether the search settled, and how many independent starts agree."""
-    verdict = _BECAUSE[evidence.because if evidence.settled else None]
-    return (
-        f"{verdict}: {evidence.agreeing_starts} of {evidence.independent_starts} independent "
-        "starts ended here"
-    )
+    starts = f"{evidence.agreeing_starts} of {evidence.independent_starts}"
+    return f"{_BECAUSE[evidence.because]}: {starts} independent starts ended here"
 
 
 def describe_order(comparison: OrderComparison) -> str:

@@ -1,7 +1,7 @@
 """Judge a result: whether its estimates can be relied on, and what speaks against it.
 
-One function judges a result in memory and a stored one, so that every page and command says the
-same. A new kind of reason is a function of the evidence in `_FINDERS`.
+A result is judged once, when it is concluded; every page and command says what it says. A new kind
+of reason is a function of the evidence in `_FINDERS`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -23,7 +23,6 @@ Severity = Literal["note", "caution", "serious"]
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
 _UNLIKELY = 1e-3  # probability of such residuals under a true model
 _SEPARABLE_STDERRS = 2.0  # a smaller time lag is not distinguishable from 0
-_EXPLAINED = 99.999  # %: what is left are errors of the solver
 _DEPENDENT = "order-dependent", "prediction-dependent", "hold-dependent"
 _LITTLE = 30.0  # %: a smaller fit is serious if the residuals are not noise
 _NOTABLE_LOSS = 20.0  # percentage points of fit, from estimation to validation
@@ -245,8 +244,6 @@ def _find_no_fit(evidence: Evidence) -> Iterator[Reason]:
 
 def _find_straight_line(evidence: Evidence) -> Iterator[Reason]:
     """Find outputs that a straight line explains better, over all experiments or in one."""
-    if _is_explained(evidence):
-        return
     outputs = dict.fromkeys(one.output for one in evidence.channels if one.is_worse_than_line)
     failed = [name for name in outputs if _is_worse_than_line(evidence.channels, name)]
     if failed:
@@ -428,7 +425,10 @@ _FINDERS: tuple[Callable[[Evidence], Iterator[Reason]], ...] = (
 
 
 def _is_explained(evidence: Evidence) -> bool:
-    return _is_number(evidence.fit_percent) and evidence.fit_percent >= _EXPLAINED
+    # This imports NumPy, which the client's types do without.
+    from sysid.simulation.fit_metrics import EXPLAINED_PERCENT
+
+    return _is_number(evidence.fit_percent) and evidence.fit_percent >= EXPLAINED_PERCENT
 
 
 def _join(names: Sequence[str]) -> str:

@@ -171,7 +171,7 @@ def _get_turn(search: SearchRecord) -> Turn:
 
 @jit_compile
 def has_scattered(search: SearchRecord) -> bool:
-    """Return whether the turn of the last local search was to scatter the population."""
+    """Return whether the rough cycle scatters at the last local search, whichever is followed."""
     return bool(_get_rough_turn(search).settled[0].probes == SCATTER.probes)
 
 

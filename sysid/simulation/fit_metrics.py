@@ -6,6 +6,9 @@ import numpy as np
 
 from sysid.core.types import FloatArray
 
+EXPLAINED_PERCENT = 99.999
+"""Fit (%) from which on what is left are errors of the solver."""
+
 
 def compute_mean(values: FloatArray) -> float:
     """Compute the mean, with the bits of NumPy's. That takes longer for so few values."""
@@ -75,8 +78,8 @@ class ChannelMetrics:
 
     @property
     def is_worse_than_line(self) -> bool:
-        """Whether a straight line fits better than the model."""
-        return self.rms > self.line_rms
+        """Whether a straight line fits better than the model, by more than errors of the solver."""
+        return self.rms > self.line_rms and not self.fit_percent >= EXPLAINED_PERCENT
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,16 +5,15 @@ it becomes the field of a body with the same name, default, bounds and sentence.
 not know the fields that a body derives: what is read are the settings, by `read_settings`.
 """
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
-from functools import lru_cache, reduce
-from inspect import getdoc
+from functools import reduce
 from operator import or_
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import pydantic
 
+from service.core.bodies.descriptions import describe_field
 from service.core.bodies.wire import Body
 from sysid.core.errors import InvalidSettings, join_pointer, suggest_name
 from sysid.core.settings import Bounds, find_bounds, list_members
@@ -25,8 +24,6 @@ Limits = Mapping[str, Any]
 """Constraints that a request has besides those of the core, as `pydantic.Field` takes them."""
 
 _CONSTRAINTS = {"least": "ge", "above": "gt", "below": "lt", "most": "le"}
-_ATTRIBUTES = re.compile(r"^Attributes\n-+\n(.*?)(?=\n\n\S+\n-+\n|\Z)", re.DOTALL | re.MULTILINE)
-_ENTRY = re.compile(r"^(\w+) : .*\n((?: {4}.*\n?)+)", re.MULTILINE)
 
 
 def derive_fields(
@@ -53,7 +50,7 @@ def derive_fields(
                 _to_wire_type(hints[field.name], groups, limits.get(field.name, {})),
                 pydantic.Field(
                     default=_to_default(field, groups),
-                    description=describe_settings(kind).get(field.name),
+                    description=describe_field(kind, field.name).text,
                 ),
             )
             for field in fields(kind)
@@ -76,7 +73,7 @@ def take_setting(kind: type, name: str) -> Any:
     bounds = next(filter(None, map(find_bounds, members)), None)
     return pydantic.Field(
         default=_to_default(field, {}),
-        description=describe_settings(kind).get(name),
+        description=describe_field(kind, name).text,
         **_write_bounds(bounds),
     )
 
@@ -97,23 +94,6 @@ def read_settings(kind: type[Settings], document: Mapping[str, Any], pointer: st
             raise InvalidSettings(place, f"unknown setting{suggest_name(name, hints)}")
         values[name] = _read_value(hints[name], value, place)
     return kind(**values)
-
-
-@lru_cache
-def describe_settings(kind: type) -> Mapping[str, str]:
-    """Describe each setting of a dataclass, from its "Attributes", as a wire type does.
-
-    Python started with ``-OO`` has no docstrings, and so no descriptions.
-    """
-    section = _ATTRIBUTES.search(getdoc(kind) or "")
-    entries = _ENTRY.findall(section[1]) if section else []
-    return {name: _to_wire_text(" ".join(text.split())) for name, text in entries}
-
-
-def _to_wire_text(sentence: str) -> str:
-    text = sentence.replace("``", "`").removesuffix(".")
-    text = re.sub(r"\bNone\b", "null", text)
-    return text if text[:2].isupper() else text[:1].lower() + text[1:]
 
 
 def _to_wire_type(annotation: Any, groups: Mapping[type, type[Body]], limits: Limits) -> Any:

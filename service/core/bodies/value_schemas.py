@@ -6,31 +6,20 @@ the section *Attributes* of each class.
 """
 
 import inspect
-import re
 from collections.abc import Callable, Mapping
 from functools import cache
 from types import NoneType, UnionType
-from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 from pydantic import Field, create_model
 from pydantic.fields import FieldInfo
 
+from service.core.bodies.descriptions import describe_field
 from service.core.bodies.wire import Answer, DescribedBy, Finite
 from sysid.core.value_documents import has_fields, list_fields
 
 Wire = TypeVar("Wire", bound=Answer)
-
-_ATTRIBUTES = re.compile(r"^Attributes\n-{10}\n(.*?)(?=\n\n\w+\n-{3,}\n|\Z)", re.S | re.M)
-_ATTRIBUTE = re.compile(r"^(\w+) : (.*)\n((?:^    .*\n?)+)", re.M)
-_SHAPE = re.compile(r"shape \((.*?)\)")
-
-
-class DescribedField(NamedTuple):
-    """What a docstring says of a field: its meaning, and the axes of an array."""
-
-    text: str
-    axes: int
 
 
 def extend_by(kind: type) -> Callable[[type[Wire]], type[Wire]]:
@@ -75,19 +64,6 @@ def describe_value(kind: type) -> type[Answer]:
     return _create(f"{kind.__name__}Out", Answer, summary, _list_fields(kind))
 
 
-@cache
-def read_descriptions(kind: type) -> Mapping[str, DescribedField]:
-    """Read what the docstring of a class, or of its bases, says of each field."""
-    described: dict[str, DescribedField] = {}
-    for base in reversed(kind.__mro__):
-        section = _ATTRIBUTES.search(inspect.cleandoc(base.__dict__.get("__doc__") or ""))
-        for name, type_text, text in _ATTRIBUTE.findall(section[1] + "\n" if section else ""):
-            shape = _SHAPE.search(type_text)
-            axes = len([axis for axis in shape[1].split(",") if axis.strip()]) if shape else 0
-            described[name] = DescribedField(_write_description(text), axes)
-    return described
-
-
 def _create(name: str, base: type[Wire], doc: str | None, fields: Mapping[str, Any]) -> type[Wire]:
     return create_model(name, __base__=base, __doc__=doc, __module__=base.__module__, **fields)
 
@@ -98,10 +74,9 @@ def _list_fields(kind: type) -> dict[str, tuple[Any, FieldInfo]]:
     A document has all of them. Numbers that are written with few digits are many: lists of values
     leave them out.
     """
-    described = read_descriptions(kind)
     fields = {}
     for field in list_fields(kind):
-        text, axes = described[field.name]
+        text, axes = describe_field(kind, field.name)
         default: Any = ... if field.digits is None else None
         fields[field.name] = _to_wire(field.hint, axes), Field(default, description=text)
     return fields
@@ -125,9 +100,3 @@ def _to_wire(hint: Any, axes: int) -> Any:
     if isinstance(origin, type) and issubclass(origin, Mapping):
         return dict[str, _to_wire(get_args(hint)[1], 0)]  # type: ignore[misc]
     return describe_value(hint) if has_fields(hint) else hint
-
-
-def _write_description(text: str) -> str:
-    """Write a description in one line, as those of other fields: no capital, no full stop."""
-    line = " ".join(text.split()).removesuffix(".")
-    return line if line[:2].isupper() or line[1:2] == " " else line[:1].lower() + line[1:]

@@ -102,7 +102,9 @@ def parse_stamps(
     readings = {order: read for order, read in attempts.items() if not np.isnat(read).any()}
     if not readings:
         place = int(np.flatnonzero(np.isnat(attempts[DAY_FIRST]))[0])
-        raise _build_stamp_error(texts, place, rows, name, f"a time stamp such as {first}")
+        is_date = STAMP.fullmatch(str(texts[place])) is not None
+        wanted = "a date that exists, from 1678 to 2261" if is_date else f"a stamp such as {first}"
+        raise _build_stamp_error(texts, place, rows, name, wanted)
     order = min(readings, key=lambda order: _rank_reading(readings[order]))
     if len(attempts) > 1:
         notes.append(f"dates of column {name!r} were read with the {order}")

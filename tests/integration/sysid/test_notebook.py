@@ -227,6 +227,7 @@ def test_numbers_that_json_lacks_are_saved(frame_result: Identification, tmp_pat
 
 DAMAGES = [
     (lambda d: d.update(format="lagid-model/1"), "read it with load_identified"),
+    (lambda d: d.update(format="lagid-identification/1"), "a build before 0.1.0 saved it"),
     (lambda d: d.update(format="other/7"), "its format is 'other/7'; need 'lagid-identification"),
     (lambda d: d.pop("rms"), "/rms: found None; need this field"),
     (lambda d: d.update(rms="many"), "/rms: found 'many'; need a number"),

@@ -11,10 +11,10 @@ from pydantic import ValidationError
 
 from service.core.bodies.derived_bodies import (
     derive_fields,
-    describe_settings,
     read_settings,
     take_setting,
 )
+from service.core.bodies.descriptions import describe_fields
 from service.core.bodies.wire import Body
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import (
@@ -185,7 +185,8 @@ def test_a_setting_without_a_default_is_needed() -> None:
 
 def test_python_without_docstrings_has_bodies_without_descriptions() -> None:
     code = (
-        "from service.jobs.job_schemas import JobIn; print(JobIn.model_fields['skip'].description)"
+        "import service.api.app; from service.jobs.job_schemas import JobIn; "
+        "print(JobIn.model_fields['skip'].description)"
     )
     done = subprocess.run(
         [sys.executable, "-OO", "-c", code],
@@ -213,4 +214,4 @@ def test_python_without_docstrings_has_bodies_without_descriptions() -> None:
     ],
 )
 def test_every_setting_of_the_core_is_described(kind: type) -> None:
-    assert list(describe_settings(kind)) == [one.name for one in fields(kind)]
+    assert list(describe_fields(kind)) == [one.name for one in fields(kind)]

@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable
 from contextlib import chdir
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from pydantic import ValidationError
@@ -23,13 +23,13 @@ from sysid.core.settings import (
     NOISE_MODELS,
     PREDICTION_KINDS,
     SEARCH_METHODS,
-    SEQUENCE_KINDS,
-    TOPOLOGIES,
     FitSettings,
     GeneticAlgorithm,
     IslandChange,
     Migration,
+    SequenceKind,
     Stop,
+    TopologyName,
 )
 from sysid.data.noise import Noise
 from sysid.data.records import HOLDS
@@ -67,10 +67,10 @@ def test_the_defaults_of_the_job_body_are_those_of_the_core() -> None:
 
 
 def test_the_wire_types_take_every_name_of_the_core_and_its_bounds() -> None:
-    every = [{"algorithm": {"migration": {"topology": name}}} for name in TOPOLOGIES] + [
-        {"algorithm": {"method": name}} for name in SEARCH_METHODS
-    ]
-    every += [{"algorithm": {"sequence": {"kind": name}}} for name in SEQUENCE_KINDS]
+    every = [
+        {"algorithm": {"migration": {"topology": name}}} for name in get_args(TopologyName)
+    ] + [{"algorithm": {"method": name}} for name in SEARCH_METHODS]
+    every += [{"algorithm": {"sequence": {"kind": name}}} for name in get_args(SequenceKind)]
     every += [{"loss": {"kind": name}} for name in LOSS_KINDS]
     every += [{"loss": {"noise_model": name}} for name in NOISE_MODELS]
     every += [{"prediction": name} for name in PREDICTION_KINDS]

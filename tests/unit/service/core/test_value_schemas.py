@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import pytest
 from pydantic import Field
 
+from service.core.bodies.descriptions import describe_fields
 from service.core.bodies.value_schemas import (
     describe_value,
     extend_by,
     extend_later_by,
-    read_descriptions,
 )
 from service.core.bodies.wire import Answer
 from sysid.core.types import FloatArray
@@ -114,6 +114,6 @@ def list_parts(kind: type) -> set[type]:
 
 @pytest.mark.parametrize("kind", sorted(list_parts(Result), key=str))
 def test_every_field_of_a_result_is_described(kind: type) -> None:
-    described = read_descriptions(kind)
+    described = describe_fields(kind)
     for field in list_fields(kind):
         assert described[field.name].text, field.name

@@ -2,7 +2,7 @@
 
 import json
 import re
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ import yaml
 
 from service.datasets.dataset_schemas import DeriveIn
 from service.jobs.job_schemas import JobIn
-from sysid.core.settings import SEARCH_METHODS, TOPOLOGIES
+from sysid.core.settings import SEARCH_METHODS, TopologyName
 from sysid.data.derivations import STEPS, derive_recording
 from sysid.data.noise import NOISE_KINDS
 from sysid.data.records import HOLDS, Channel, Recording, Segment
@@ -86,7 +86,7 @@ def list_named(path: str) -> set[str]:
 
 
 def test_the_fields_that_take_names_are_found() -> None:
-    assert set(TOPOLOGIES) == CHOICES["algorithm.migration.topology"]
+    assert set(get_args(TopologyName)) == CHOICES["algorithm.migration.topology"]
     assert set(SEARCH_METHODS) == CHOICES["algorithm.method"] == CHOICES["algorithm.islands.method"]
     assert set(HOLDS) == CHOICES["hold"]
 

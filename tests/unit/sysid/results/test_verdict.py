@@ -1,6 +1,7 @@
 """The verdict of a result: what speaks against it, the most severe first."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -47,7 +48,9 @@ def test_a_straight_line_through_a_part_or_the_errors_of_the_solver_is_not_serio
     quiet = [make_channel(0.1, 2.0), make_channel(0.11, 0.1, 1)]
     text = "trustworthy, but a straight line explains a part of y better"
     assert read_verdict(channels=quiet) == ("limited", text)
-    assert read_verdict(channels=quiet, fit_percent=99.9999) == ("trustworthy", "trustworthy")
+    exact = [replace(channel, fit_percent=99.9999) for channel in quiet]
+    assert not any(channel.is_worse_than_line for channel in exact)  # so no note says it either
+    assert read_verdict(channels=exact) == ("trustworthy", "trustworthy")
     few = [make_channel(0.1, math.nan), make_channel(0.1, 2.0, 1)]
     assert read_verdict(channels=few) == ("trustworthy", "trustworthy")
 
