@@ -43,8 +43,17 @@ EVENT_TIMEOUT_SECONDS = 45.0
 
 
 def choose_url(url: str | None) -> str:
-    """Return the address of the server: as given, else that of LAGID_URL, else the default."""
-    return (url or os.environ.get(URL_VARIABLE) or DEFAULT_URL).rstrip("/")
+    """Return the address of the server: as given, else that of LAGID_URL, else the default.
+
+    Raises
+    ------
+    ClientError
+        If it does not begin with http:// or https://.
+    """
+    chosen = (url or os.environ.get(URL_VARIABLE) or DEFAULT_URL).rstrip("/")
+    if not chosen.lower().startswith(("http://", "https://")):
+        raise ClientError(f"found the address {chosen!r}; write http://{chosen.split('://')[-1]}")
+    return chosen
 
 
 def choose_key(key: str | None) -> str | None:
@@ -223,10 +232,18 @@ def build_event_stream(job: str, after: str | None) -> RestCall[bytes]:
 def build_upload(
     source: str | Path | bytes, name: str | None, segments: str | None, sample_time: float | None
 ) -> RestCall[Any]:
-    """Build the call that stores a file or bytes."""
+    """Build the call that stores a file or bytes.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    """
     content = source if isinstance(source, bytes) else Path(source)
     kind = FILE_TYPE
     if isinstance(content, Path):
+        if not content.exists():
+            raise FileNotFoundError(f"there is no file {content}")
         kind = MCAP_TYPE if content.suffix.lower() == ".mcap" else FILE_TYPE
         name = name or content.name.removesuffix(".gz").rpartition(".")[0] or content.name
     upload = call("POST /v1/datasets", name=name, segments=segments, sample_time=sample_time)
