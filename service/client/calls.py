@@ -232,18 +232,10 @@ def build_event_stream(job: str, after: str | None) -> RestCall[bytes]:
 def build_upload(
     source: str | Path | bytes, name: str | None, segments: str | None, sample_time: float | None
 ) -> RestCall[Any]:
-    """Build the call that stores a file or bytes.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    """
+    """Build the call that stores a file or bytes."""
     content = source if isinstance(source, bytes) else Path(source)
     kind = FILE_TYPE
     if isinstance(content, Path):
-        if not content.exists():
-            raise FileNotFoundError(f"there is no file {content}")
         kind = MCAP_TYPE if content.suffix.lower() == ".mcap" else FILE_TYPE
         name = name or content.name.removesuffix(".gz").rpartition(".")[0] or content.name
     upload = call("POST /v1/datasets", name=name, segments=segments, sample_time=sample_time)

@@ -81,6 +81,8 @@ class Operations(Exchange):
         sample_time: float | None = None,
     ) -> RestCall[documents.DatasetDocument]:
         """Store a recording from a file of any kind that is read, or from its bytes."""
+        if not (isinstance(source, bytes) or Path(source).exists()):
+            raise FileNotFoundError(f"there is no file {source}")
         return build_upload(source, name, segments, sample_time)
 
     @fetch
