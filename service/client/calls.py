@@ -43,8 +43,17 @@ EVENT_TIMEOUT_SECONDS = 45.0
 
 
 def choose_url(url: str | None) -> str:
-    """Return the address of the server: as given, else that of LAGID_URL, else the default."""
-    return (url or os.environ.get(URL_VARIABLE) or DEFAULT_URL).rstrip("/")
+    """Return the address of the server: as given, else that of LAGID_URL, else the default.
+
+    Raises
+    ------
+    ClientError
+        If it does not begin with http:// or https://.
+    """
+    chosen = (url or os.environ.get(URL_VARIABLE) or DEFAULT_URL).rstrip("/")
+    if not chosen.lower().startswith(("http://", "https://")):
+        raise ClientError(f"found the address {chosen!r}; write http://{chosen.split('://')[-1]}")
+    return chosen
 
 
 def choose_key(key: str | None) -> str | None:

@@ -138,10 +138,10 @@ def _make_answer(
     kind: Any,
 ) -> Method[P, Result, Coroutine[Any, Any, Result]]:
     def wait(client: Any, /, *arguments: P.args, **options: P.kwargs) -> Result:
-        return gather(carry_out(operate(client, *arguments, **options)))
+        return gather(carry_out(_begin(wait, operate, client, *arguments, **options)))
 
     async def await_all(client: Any, /, *arguments: P.args, **options: P.kwargs) -> Result:
-        steps = operate(client, *arguments, **options)
+        steps = _begin(await_all, operate, client, *arguments, **options)
         return gather([item async for item in carry_out_awaiting(steps)])
 
     return Method(copy_appearance(wait, model, kind), copy_appearance(await_all, model, kind))
@@ -151,15 +151,31 @@ def _make_iterator(
     operate: SteppedOperation[P, T], model: Callable[..., Any], content: Any
 ) -> Method[P, Iterator[T], AsyncIterator[T]]:
     def go(client: Any, /, *arguments: P.args, **options: P.kwargs) -> Iterator[T]:
-        return carry_out(operate(client, *arguments, **options))
+        return carry_out(_begin(go, operate, client, *arguments, **options))
 
     def go_awaiting(client: Any, /, *arguments: P.args, **options: P.kwargs) -> AsyncIterator[T]:
-        return carry_out_awaiting(operate(client, *arguments, **options))
+        return carry_out_awaiting(_begin(go_awaiting, operate, client, *arguments, **options))
 
     return Method(
         copy_appearance(go, model, GenericAlias(Iterator, content)),
         copy_appearance(go_awaiting, model, GenericAlias(AsyncIterator, content)),
     )
+
+
+def _begin(
+    method: Callable[..., Any],
+    operate: SteppedOperation[P, T],
+    client: Any,
+    /,
+    *arguments: P.args,
+    **options: P.kwargs,
+) -> Steps[T]:
+    """Begin an operation; arguments that do not fit are told by the name of the method."""
+    try:
+        signature(method).bind(client, *arguments, **options)
+    except TypeError as error:
+        raise TypeError(f"{method.__qualname__}() {error}") from None
+    return operate(client, *arguments, **options)
 
 
 def copy_appearance(function: Function, model: Callable[..., Any], kind: Any) -> Function:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from http import HTTPStatus
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import httpx
 
@@ -20,6 +20,7 @@ from service.client.calls import (
     FIRST_PAUSE_SECONDS,
     POLL_SECONDS,
     TERMINAL_STATES,
+    ClientError,
     Document,
     EventParser,
     RestCall,
@@ -80,6 +81,8 @@ class Operations(Exchange):
         sample_time: float | None = None,
     ) -> RestCall[documents.DatasetDocument]:
         """Store a recording from a file of any kind that is read, or from its bytes."""
+        if not (isinstance(source, bytes) or Path(source).exists()):
+            raise FileNotFoundError(f"there is no file {source}")
         return build_upload(source, name, segments, sample_time)
 
     @fetch
@@ -124,8 +127,10 @@ class Operations(Exchange):
         return call("GET /v1/datasets/{}/content", dataset)
 
     @fetch_pieces
-    def download(self, dataset: str, format: str = "mcap") -> RestCall[bytes]:
+    def download(self, dataset: str, format: Literal["mcap", "csv"] = "mcap") -> RestCall[bytes]:
         """Download a dataset piece by piece: mcap or csv."""
+        if format not in ("mcap", "csv"):
+            raise ClientError(f"format: found {format!r}; need mcap or csv")
         return call(f"GET /v1/datasets/{{}}/content{'.csv' if format == 'csv' else ''}", dataset)
 
     @fetch

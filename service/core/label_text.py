@@ -24,7 +24,9 @@ _NUMBER = re.compile(r"[+-]?[0-9]*\.?[0-9]+([eE][+-]?[0-9]+)?")
 
 def format_count(value: float | None) -> str:
     """Format a whole number in groups of three digits."""
-    return DASH if value is None else f"{value:,.0f}".replace(",", _THIN_SPACE)
+    if value is None or not math.isfinite(value):
+        return DASH
+    return f"{value:,.0f}".replace(",", _THIN_SPACE)
 
 
 def format_duration(seconds: float | None) -> str:

@@ -110,6 +110,8 @@ _NO_FILE = " A table is a recording already: give it to identify, or to Recordin
 def _read_file(path: Path, options: ReadOptions) -> tuple[Recording, tuple[str, ...]]:
     if path.is_dir():
         raise UnreadableFile("it is a folder; need a file")
+    if not path.exists():
+        raise FileNotFoundError(f"there is no file {path}")
     from service.formats.tabular.csv_recordings import read_csv
 
     sample_time, segments, limits = options.sample_time, options.segments, options.limits

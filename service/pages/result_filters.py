@@ -65,7 +65,7 @@ def describe_hypothesis(test: ResidualTest) -> str:
 
 def format_share(share: float | None) -> str:
     """Format a share in percent."""
-    return DASH if share is None else f"{100 * share:.0f}\u202f%"
+    return DASH if share is None or not isfinite(share) else f"{100 * share:.0f}\u202f%"
 
 
 def format_onset_text(onset: OnsetDelay) -> str:
@@ -93,7 +93,8 @@ def describe_group(group: IdentifiableCombination) -> str:
 
 def format_delay_text(fit: OrderFit, unit: str) -> str:
     """Format the dead time of an order with its unit."""
-    return join_estimate(fit.delay, fit.delay_stderr) + plain_unit(unit)
+    text = join_estimate(fit.delay, fit.delay_stderr)
+    return text if text == DASH else text + plain_unit(unit)
 
 
 def format_excess_bic(fit: OrderFit, comparison: OrderComparison) -> str:

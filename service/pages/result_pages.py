@@ -16,6 +16,7 @@ from service.repositories.result_rows import ResultRow, list_results
 from service.repositories.search_conditions import ListFilter
 from service.storage.statements import RowPage
 from sysid.core.text import find_shown_error
+from sysid.core.value_documents import encode
 from sysid.figures.plotly import Figure, empty_figure
 from sysid.uncertainty.estimates import Estimate
 
@@ -143,7 +144,7 @@ def write_results_csv(session: Session, choice: ResultChoice) -> str:
     """Write the parameter of the page as CSV, from this page on, and of more runs."""
     page = _list_page(session, choice, RUNS_OF_A_FILE)
     _, entries = _choose_parameter(page.items, choice.parameter)
-    return write_csv([COLUMNS, *(_list_fields(row, one) for row, one in entries)])
+    return write_csv([COLUMNS, *(encode(_list_fields(row, one)) for row, one in entries)])
 
 
 def _list_fields(row: ResultRow, one: Estimate) -> tuple[object, ...]:
@@ -165,7 +166,7 @@ def _list_fields(row: ResultRow, one: Estimate) -> tuple[object, ...]:
         one.unit,
         one.status,
         row.fit_estimation,
-        row.finished_at.isoformat() if row.finished_at else None,
+        row.finished_at,
     )
 
 

@@ -145,11 +145,9 @@ def _read_values(stored: StoredRun) -> Iterator[IdentifiedValue]:
         yield IdentifiedValue(one.name, one.value, one.unit, one.stderr, one.status)
 
 
-def _compute_covariance(
-    result: Result | None, values: tuple[IdentifiedValue, ...]
-) -> Covariance | None:
+def _compute_covariance(result: Result, values: tuple[IdentifiedValue, ...]) -> Covariance | None:
     """Compute the covariance from correlations and standard errors; ``nan`` if one is missing."""
-    if result is None or result.correlation is None:
+    if result.correlation is None:
         return None
     correlation = result.correlation
     errors = {value.name: np.nan if value.stderr is None else value.stderr for value in values}

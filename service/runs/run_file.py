@@ -62,7 +62,7 @@ def _write_run_file(session: Session, store: ObjectStore, stored: StoredRun) -> 
         target,
         inputs=_read_inputs(session, store, stored),
         run=_describe_run(stored, datasets),
-        started_at=_find_clock(stored, datasets),
+        started_at=_find_clock(datasets),
     )
     return target.getvalue()
 
@@ -124,7 +124,7 @@ def _describe_run(stored: StoredRun, datasets: Mapping[str, Dataset]) -> dict[st
     }
 
 
-def _find_clock(stored: StoredRun, datasets: Mapping[str, Dataset]) -> datetime | None:
+def _find_clock(datasets: Mapping[str, Dataset]) -> datetime | None:
     """Find time 0 s on the clock that recorded, if all experiments have the times of one dataset.
 
     Segments begin at times of their own.

@@ -52,8 +52,10 @@ def find_shown_error(stderr: float | None, status: str) -> float | None:
 def format_estimate(value: float, stderr: float | None, *, status: str = "") -> tuple[str, str]:
     """Format an estimate and its standard error, both to the error's second significant digit.
 
-    The error is empty where `find_shown_error` finds none.
+    The error is empty where `find_shown_error` finds none, and for a value that is not finite.
     """
+    if not math.isfinite(value):
+        return DASH, ""
     if status == _AT_BOUND:
         return f"{value:.6g}".replace("-", "−"), ""
     stderr = find_shown_error(stderr, status)
@@ -86,6 +88,8 @@ def format_interval(ends: Sequence[float] | None, stderr: float | None, *, statu
     """Format a 95 % interval, to the digits of the standard error; empty without one."""
     if ends is None or status in _WITHOUT_ERROR:
         return ""
+    if not any(map(math.isfinite, ends)):
+        return DASH
     low, high = (format_estimate(end, stderr)[0] for end in ends)
     return f"{low} … {high}"
 
@@ -99,7 +103,7 @@ def format_criterion(value: float | None) -> str:
 
 def format_p_value(p: float | None) -> str:
     """Format the p value of a test."""
-    if p is None:
+    if p is None or not math.isfinite(p):
         return DASH
     return "< 0.001" if p < 0.001 else f"{p:.3f}"
 

@@ -12,10 +12,11 @@ exact
     the one that was written.
 
 What is read is checked field by field against the declared types, so that a damaged document is
-told by the place of its fault.
+told by the place of its fault. Of an array the entries are checked, not the shape.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from datetime import datetime
 from functools import cache
@@ -34,6 +35,7 @@ Writers = Mapping[type, Callable[[Any], Any]]
 Readers = Mapping[type, Callable[[Any], Any]]
 
 _PLAIN = frozenset({NoneType, str, int, bool})
+_NUMBERS = frozenset({float, int})
 _LARGE = 100  # numbers of an array: NumPy finds those that are not finite in less time than Python
 _NOT_FINITE = {"nan": nan, "inf": float("inf"), "-inf": float("-inf")}
 
@@ -377,10 +379,11 @@ def _make_scalar_reader(kind: type) -> Callable[[Any], Any]:
 def _read_number(value: Any) -> float:
     if value.__class__ is float:
         return value
-    if value.__class__ is int:
-        return float(value)
     if value is None:
         return nan
+    if value.__class__ is int:
+        with suppress(OverflowError):  # JSON has whole numbers of any size
+            return float(value)
     raise Misfit(value, "a number")
 
 
@@ -392,23 +395,33 @@ def _read_exact_number(value: Any) -> float:
     return _read_number(value)
 
 
-def _read_array(value: Any) -> FloatArray:
-    if not isinstance(value, list):
-        raise Misfit(value, "a list of numbers")
-    try:
-        return np.array(value, dtype=np.float64)  # "nan", "inf" and null are numbers here too
-    except (TypeError, ValueError):
-        raise Misfit(value, "a list of numbers") from None
+def _read_array(value: Any, others: tuple[Any, ...] = (None,)) -> FloatArray:
+    """Read rows of numbers, and of others that NumPy takes for numbers."""
+    with suppress(TypeError, ValueError, OverflowError):
+        array = np.array(value, dtype=np.float64)
+        if isinstance(value, list) and _has_only_numbers(value, others):
+            return array
+    raise Misfit(value, "a list of numbers")
+
+
+def _has_only_numbers(items: list[Any], others: tuple[Any, ...]) -> bool:
+    return {*map(type, items)} <= _NUMBERS or all(
+        _has_only_numbers(item, others)
+        if isinstance(item, list)
+        else type(item) in _NUMBERS or item in others
+        for item in items
+    )
 
 
 def _read_exact_array(value: Any) -> FloatArray:
     if not isinstance(value, dict):
-        return _read_array(value)
+        return _read_array(value, tuple(_NOT_FINITE))
     shape = value.get("shape")
     is_shape = isinstance(shape, list) and all(type(n) is int and n >= 0 for n in shape)
-    if not is_shape or 0 not in shape:  # type: ignore[operator]
-        raise Misfit(value, "the shape of an empty array")
-    return np.zeros(tuple(shape))  # type: ignore[arg-type]
+    if is_shape and 0 in shape:  # type: ignore[operator]
+        with suppress(ValueError, OverflowError):  # too many axes, or too long ones
+            return np.zeros(tuple(shape))  # type: ignore[arg-type]
+    raise Misfit(value, "the shape of an empty array")
 
 
 def _read_moment(value: Any) -> datetime:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+from sysid.core.errors import InvalidRecord
 from sysid.core.settings import LossKind, PredictionKind
 from sysid.core.text import find_rms_unit
 from sysid.core.types import FloatArray
@@ -234,6 +235,11 @@ class FittedData:
         Expressions of parameters that were tied besides those of the model.
     channels : mapping of str to str
         Channel of each signal in the first recording: model's name → channel's name.
+
+    Raises
+    ------
+    InvalidRecord
+        If there is no record, or one without outputs.
     """
 
     model: Model
@@ -245,6 +251,10 @@ class FittedData:
     prediction: PredictionKind = "simulation"
     ties: Mapping[str, str] = field(default_factory=dict)
     channels: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not (self.records and all(record.outputs for record in self.records)):
+            raise InvalidRecord("a result has no record, or one without outputs; need both")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -371,11 +371,6 @@ class Problem:
                 total += float(np.sum(np.square(weight[scored] * centred)))
         return sqrt(total / max(self.n_scored, 1))
 
-    def evaluate_metrics(self, theta: FloatArray) -> Metrics:
-        """Compute the agreement of one individual (D,) with the scored samples of the records."""
-        simulated = self.predict(np.atleast_2d(theta))[0]
-        return compute_metrics(self, simulated)
-
     def _list_channels(self, values: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         pairs = zip(
             self.split_by_output(values), self.split_by_output(self.plain_weight), strict=True

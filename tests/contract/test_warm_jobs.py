@@ -226,11 +226,6 @@ def test_runs_that_begin_cold_do_not_wait_beside_those_that_follow_one_another(p
     assert warm == [(), (), (), (), (read_values(runs[3]),), (read_values(runs[4]),)]
 
 
-def all_rows(session, claim):
-    of_job = select(Run).where(Run.job_id == claim.job.id)
-    return session.scalars(of_job.order_by(Run.number)).all()
-
-
 def statements_behind(place, n_failed):
     """SQL statements that it takes to learn what the last of a chain begins with."""
     job = place.submit(

@@ -1,9 +1,9 @@
 """Ends what a session of tests has started and removes its folder, also when pytest is killed.
 
-Run as ``python guard.py PYTEST FOLDER``: a process beside pytest. It waits until pytest has ended,
-or has asked for the end on standard input. It finds the processes of the session by a variable of
-their environment, or by their open files. It finds their descendants too: workers of Ray and
-PostgreSQL overwrite the memory that shows their environment.
+Run as ``python session_guard.py PYTEST FOLDER``: a process beside pytest. It waits until pytest has
+ended, or has asked for the end on standard input. It finds the processes of the session by a
+variable of their environment, or by their open files. It finds their descendants too: workers of
+Ray and PostgreSQL overwrite the memory that shows their environment.
 """
 
 import contextlib

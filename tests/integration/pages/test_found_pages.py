@@ -22,7 +22,7 @@ from service.models.models import add_model
 from service.pages import job_pages
 from service.pages.lineage_drawing import MAX_CHARACTERS, LineageDrawing, draw_lineage
 from service.repositories.lineage_rows import LineageRepository
-from service.storage.tables import Job
+from service.storage.tables import Job, Run
 from sysid.data.holds import HOLD_TEXTS, HOLDS, HoldSetting
 from sysid.data.records import Channel, Recording
 from sysid.figures.data import ExperimentTraces, OutputTraces, SignalTrace
@@ -320,3 +320,26 @@ def test_one_parameter_of_the_runs_of_all_jobs_is_a_table_a_figure_and_a_file(
     assert none["data"] == []
     assert client.get("/results?cursor=x").status_code == 422
     assert "no such free parameter" in client.get("/results?parameter=other").text
+
+
+def test_a_number_that_is_not_finite_is_an_empty_cell_and_a_dash(
+    client: TestClient, filled_folder: FilledFolder
+) -> None:
+    with parts_of(client).database.write_session() as session:
+        run = session.get_one(Run, filled_folder.finished_run)
+        before = run.result
+        assert before is not None
+        first, *others = before["parameters"]
+        damaged = {**first, "value": None, "interval95": [None, 3.053]}
+        run.result = {**before, "parameters": [damaged, *others]}
+    try:
+        page = client.get(f"/runs/{filled_folder.finished_run}").text
+        file = client.get(f"/pages/results.csv?parameter={first['name']}").text
+    finally:
+        with parts_of(client).database.write_session() as session:
+            session.get_one(Run, filled_folder.finished_run).result = before
+    assert "– … 3.053" in page
+    assert not re.search(r"\bnan\b", page)
+    rows = {row["run"]: row for row in csv.DictReader(io.StringIO(file))}
+    cells = rows[filled_folder.finished_run]
+    assert [cells[name] for name in ("value", "lower95", "upper95")] == ["", "", "3.053"]

@@ -15,7 +15,6 @@ from sysid.search.refine import refine_candidates
 from tests.support.library.search_problems import COULOMB, DUFFING, clean, example, noisy, record
 
 DUFFING_MODEL = load_model("duffing-eq16")
-COULOMB_MODEL = load_model("coulomb-eq16")
 
 
 def read_values(found: Identification) -> dict[str, float]:

@@ -15,7 +15,7 @@ from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
 from sysid.results.identification import Identification
-from sysid.simulation.problem import Problem
+from sysid.simulation.problem import Problem, compute_metrics
 from sysid.simulation.simulate import simulate
 from tests.support.library.search_problems import DUFFING, force
 from workers.protocol import ProblemSpec
@@ -127,7 +127,7 @@ def test_a_worker_builds_the_part_kept_on_the_whole_record_without_noise() -> No
     assert judged.records == (record,)
     assert judged.n_scored == kept[0].outputs[0].values.size == 180
     theta = np.array([[DUFFING[p.name] for p in judged.free_parameters]])
-    assert judged.evaluate_metrics(theta[0]).rms < 1e-12
+    assert compute_metrics(judged, judged.predict(theta)[0]).rms < 1e-12
 
 
 def test_records_and_a_fraction_together_are_refused() -> None:

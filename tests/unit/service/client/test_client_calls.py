@@ -436,3 +436,36 @@ def test_types_of_answers_are_those_of_the_stub_and_stay_the_same() -> None:
     assert documents.JobDocument is documents.JobDocument
     assert pickle.loads(pickle.dumps(documents.JobDocument)) is documents.JobDocument
     assert not hasattr(documents, "NoSuchDocument")
+
+
+@pytest.mark.parametrize("name", ["job", "datasets", "iterate_datasets", "download", "events"])
+@pytest.mark.parametrize("kind", [Client, AsyncClient])
+def test_arguments_that_do_not_fit_are_told_by_the_name_of_the_method(kind: Any, name: str) -> None:
+    method: Any = getattr(kind("http://here"), name)
+    told = rf"^{kind.__name__}\.{name}\(\) too many positional arguments$"
+    with pytest.raises(TypeError, match=told):
+        await_in_thread(lambda: method(1, 2, 3))
+
+
+def test_an_argument_that_is_missing_is_told_by_the_name_of_the_method() -> None:
+    job: Any = Client("http://here").job
+    with pytest.raises(TypeError, match=r"^Client\.job\(\) missing a required argument: 'name'$"):
+        job()
+
+
+def test_another_format_of_a_download_is_refused() -> None:
+    client: Any = Client("http://here")
+    with pytest.raises(ClientError, match="format: found 'xlsx'; need mcap or csv"):
+        client.download("ds_1", format="xlsx")
+
+
+@pytest.mark.parametrize("url", ["127.0.0.1:8123", "localhost:8123/", "ftp://127.0.0.1:8123"])
+def test_an_address_without_its_scheme_is_told_how_it_is_written(url: str) -> None:
+    host = url.removeprefix("ftp://").rstrip("/")
+    with pytest.raises(ClientError, match=f"write http://{host}$"):
+        Client(url)
+
+
+def test_a_file_that_is_not_there_is_told() -> None:
+    with pytest.raises(FileNotFoundError, match=r"^there is no file nofile\.csv$"):
+        Client("http://here").add_dataset("nofile.csv")

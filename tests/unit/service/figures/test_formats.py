@@ -1,9 +1,18 @@
+import math
 from datetime import UTC, datetime, timedelta
 
 import pytest
 
 from service.core.label_text import format_age, format_count, format_duration
-from sysid.core.text import format_estimate, format_interval, format_number, format_unit
+from service.pages.result_filters import format_delay_text, format_share
+from sysid.core.text import (
+    format_estimate,
+    format_interval,
+    format_number,
+    format_p_value,
+    format_unit,
+)
+from sysid.results.parts import OrderFit
 
 
 @pytest.mark.parametrize(
@@ -39,6 +48,26 @@ def test_an_estimate_ends_where_its_error_does(
     value: float, stderr: float | None, texts: tuple[str, str]
 ) -> None:
     assert format_estimate(value, stderr) == texts
+
+
+NOT_FINITE = (math.nan, math.inf, -math.inf)
+
+
+@pytest.mark.parametrize("value", NOT_FINITE)
+def test_what_is_not_finite_is_a_dash(value: float) -> None:
+    assert format_estimate(value, 0.0065) == ("–", "")
+    assert format_estimate(value, None, status="at bound") == ("–", "")
+    assert format_interval((value, 3.0531), 0.0065) == "– … 3.0531"
+    assert format_interval((value, math.nan), 0.0065) == "–"
+    assert format_count(value) == "–"
+    assert format_share(value) == "–"
+    assert format_p_value(value) == "–"
+
+
+@pytest.mark.parametrize(("delay", "text"), [(math.nan, "–"), (0.5, "0.5000 ± 0.0065 s")])
+def test_a_dead_time_has_a_unit_only_with_a_number(delay: float, text: str) -> None:
+    fit = OrderFit("fopdt", 1, delay, 0.0065, values={}, rms=0.1, bic=0.0)
+    assert format_delay_text(fit, "s") == text
 
 
 def test_an_interval_has_the_digits_of_the_error() -> None:

@@ -141,6 +141,11 @@ def test_encodings_are_recognised(encoding: str) -> None:
     assert bool(guessed) == (encoding in ("latin-1", "cp1252"))
 
 
+def test_a_file_that_is_not_there_is_told() -> None:
+    with pytest.raises(FileNotFoundError, match=r"^there is no file nofile\.csv$"):
+        read_recording("nofile.csv")
+
+
 def test_a_compressed_text_is_read() -> None:
     check_experiment(read_csv(compress(ROWS))[0])
     with pytest.raises(UnreadableFile, match="damaged or cut off"):

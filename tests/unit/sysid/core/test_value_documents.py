@@ -75,6 +75,12 @@ def test_a_plain_document_is_read_as_the_value_and_null_as_nan() -> None:
     assert encode(found) == DOCUMENT
 
 
+def test_null_in_an_array_of_a_plain_document_is_nan_and_whole_numbers_are_numbers() -> None:
+    rows = decode(Whole, {**DOCUMENT, "rows": [[None, 2]]}).rows
+    assert rows.dtype == np.float64
+    np.testing.assert_array_equal(rows, [[math.nan, 2.0]])
+
+
 def test_of_a_subclass_only_the_fields_of_the_base_are_written() -> None:
     parts = {name: getattr(whole(), name) for name in ("parts", "pair", "rows", "by_name")}
     assert encode(Extended(**parts, secret=7), Whole) == DOCUMENT
@@ -118,7 +124,12 @@ def test_fields_with_a_default_may_be_missing() -> None:
         ({"parts": [{"value": 1, "kind": "c"}]}, "/parts/0/kind: found 'c'; need one of a, b"),
         ({"pair": {"name": "n", "size": 2.0}}, "/pair/size: found 2.0; need a whole number"),
         ({"by_name": {"a/b": "x"}}, "/by_name/a~1b: found 'x'; need a number"),
+        ({"parts": [{"value": -(10**400)}]}, "/parts/0/value: found -1.*…; need a number"),
         ({"rows": [["a"]]}, "/rows: .*need a list of numbers"),
+        ({"rows": [["1.5"]]}, "/rows: .*need a list of numbers"),
+        ({"rows": [[1, 2], [True, 3]]}, "/rows: .*need a list of numbers"),
+        ({"rows": [[1], [2, 3]]}, "/rows: .*need a list of numbers"),
+        ({"rows": 1.5}, "/rows: .*need a list of numbers"),
         ({"is_good": 1}, "/is_good: found 1; need true or false"),
         ({"other": 1}, "/: found 'other'; need one of the fields parts, pair, rows"),
     ],

@@ -14,7 +14,7 @@ from sysid.core.settings import FitSettings, Loss, PredictionKind
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.simulation.evaluator import Evaluator, evaluate_population
-from sysid.simulation.problem import Problem, build_simulation_problem
+from sysid.simulation.problem import Problem, build_simulation_problem, compute_metrics
 from tests.support.library.small_models import (
     difference,
     differential,
@@ -98,7 +98,7 @@ def test_j_is_the_rms_error_over_the_scored_samples() -> None:
     expected = np.sqrt(np.nanmean(error**2, axis=1))
     np.testing.assert_allclose(problem.evaluate_fitness(theta), expected, rtol=1e-12)
     assert problem.n_scored == 23
-    metrics = problem.evaluate_metrics(theta[1])
+    metrics = compute_metrics(problem, problem.predict(theta)[1])
     assert metrics.rms == pytest.approx(expected[1])
     assert metrics.unit == problem.unit == "m"
     assert metrics.channels[0].samples == 23
