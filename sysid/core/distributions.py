@@ -9,6 +9,9 @@ from functools import lru_cache
 from importlib import import_module
 from threading import Thread
 
+CHI_SQUARE_95 = 3.841458820694124
+"""95 % quantile of χ² with one degree of freedom: the limit of a likelihood ratio (Wilks 1938)."""
+
 _LIBRARY = "scipy.special"
 
 

@@ -19,10 +19,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sysid.core.distributions import CHI_SQUARE_95
 from sysid.core.types import BoolArray, FloatArray
 from sysid.core.units import format_unit
 from sysid.minima.projection import draw_projected_points
-from sysid.results.parts import CHI_SQUARE_95, Minimum
+from sysid.results.parts import Minimum
 from sysid.search.archive import SAME_POINT, ArchivedMinimum
 from sysid.search.refine import RefinedCandidate, refine_candidate
 from sysid.search.state import SAME_OPTIMUM

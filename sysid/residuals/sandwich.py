@@ -38,7 +38,7 @@ import numpy as np
 from numpy.fft import rfft
 from numpy.typing import NDArray
 
-from sysid.core.distributions import chi_square_tail, student_limit
+from sysid.core.distributions import CHI_SQUARE_95, chi_square_tail, student_limit
 from sysid.core.types import RANK_TOLERANCE, FloatArray, IntArray
 from sysid.residuals.autocorrelation import (
     MIN_SAMPLES,
@@ -58,8 +58,6 @@ from sysid.residuals.series import (
     iterate_parts,
 )
 from sysid.simulation.problem import Problem
-
-CHI_SQUARE_95 = 3.841458820694124  # 95 % quantile of χ² with one degree of freedom
 
 MIN_REPEATS = 5  # and two more than parameters: fewer say too little of their spread
 _CORRELATION_LEVEL = 1e-3  # of the test for correlation between outputs

@@ -9,10 +9,8 @@ import numpy as np
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 
-CHI_SQUARE_95 = 3.841
-"""Quantile of χ² with one degree of freedom."""
 STRONG_EVIDENCE = 6.0
-"""Difference of BIC: odds of 20 to 1."""
+"""Difference of BIC: odds of 20 to 1 (Kass and Raftery 1995)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
+from sysid.core.distributions import CHI_SQUARE_95
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.identifiability.exchange import ExchangeGroups, order_exchangeable
-from sysid.residuals.sandwich import CHI_SQUARE_95
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit, to_unit
 from sysid.uncertainty.analysis import Analysis

@@ -23,10 +23,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sysid.core.distributions import CHI_SQUARE_95
 from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
 from sysid.core.types import FloatArray
 from sysid.identifiability.exchange import ExchangeGroups, find_exchanges, order_exchangeable
-from sysid.residuals.sandwich import CHI_SQUARE_95, estimate_sandwich
+from sysid.residuals.sandwich import estimate_sandwich
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.simulation.loss import compute_influence
 from sysid.simulation.problem import Problem

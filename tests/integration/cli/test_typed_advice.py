@@ -118,7 +118,9 @@ def list_changes() -> list[str]:
 
 
 def test_a_set_that_is_printed_is_one_of_a_job_or_a_plant() -> None:
-    for change in list_changes():
+    changes = list_changes()
+    assert changes  # the pattern still finds what is printed
+    for change in changes:
         if change.partition("=")[0] not in {field.name for field in fields(Tube)}:
             body: dict[str, object] = dict(BODY)
             apply_setting(body, change)

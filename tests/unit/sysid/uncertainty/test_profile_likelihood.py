@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from sysid.core.distributions import CHI_SQUARE_95
 from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.core.settings import Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
-from sysid.residuals.sandwich import CHI_SQUARE_95
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
