@@ -13,17 +13,6 @@ import numpy as np
 
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
-from sysid.diagnosis.integration_step import (
-    HalfStep,
-    choose_starts,
-    compare_half_step,
-    compute_work_limit,
-    find_limit,
-    mark_changing,
-)
-from sysid.diagnosis.unrecorded_input import RecordedComparison, compare_where_recorded
-from sysid.diagnosis.validation import simulate_validation
-from sysid.diagnosis.warnings import find_delay_parameters
 from sysid.identifiability.exchange import (
     ExchangeGroups,
     find_exchanges,
@@ -33,6 +22,17 @@ from sysid.identification.budget import Budget
 from sysid.identification.deadline import Deadline
 from sysid.islands.run_state import RunState
 from sysid.islands.stopping import count_restarts
+from sysid.judgement.integration_step import (
+    HalfStep,
+    choose_starts,
+    compare_half_step,
+    compute_work_limit,
+    find_limit,
+    mark_changing,
+)
+from sysid.judgement.unrecorded_input import RecordedComparison, compare_where_recorded
+from sysid.judgement.validation import simulate_validation
+from sysid.judgement.warnings import find_delay_parameters
 from sysid.minima.local_minima import (
     LocalMinima,
     count_affordable_simulations,

@@ -11,44 +11,44 @@ from sysid.core.settings import GeneticAlgorithm
 from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
 from sysid.data.records import find_common_sample_time
-from sysid.diagnosis.fixed_start import warn_fixed_starts
-from sysid.diagnosis.hard_switching import warn_hard_switching
-from sysid.diagnosis.input_hold import (
+from sysid.identifiability.exchange import describe_exchanges
+from sysid.identification.best_estimate import IslandEnd, find_best_estimate, is_refining
+from sysid.identification.budget import Budget
+from sysid.identification.deadline import Clock, Deadline
+from sysid.islands.run_state import RunState
+from sysid.judgement.fixed_start import warn_fixed_starts
+from sysid.judgement.hard_switching import warn_hard_switching
+from sysid.judgement.input_hold import (
     describe_input_holds,
     find_hold_doubts,
     list_input_holds,
     mark_hold_dependent,
     refit_other_holds,
 )
-from sysid.diagnosis.integration_step import explain_finer_step
-from sysid.diagnosis.process_order import (
+from sysid.judgement.integration_step import explain_finer_step
+from sysid.judgement.process_order import (
     compare_orders,
     mark_order_dependent,
     warn_other_order,
 )
-from sysid.diagnosis.unstable_run import (
+from sysid.judgement.unstable_run import (
     compare_one_step,
     mark_prediction_dependent,
     warn_misled_run,
 )
-from sysid.diagnosis.validation import (
+from sysid.judgement.validation import (
     mark_refuted,
     split_outputs,
     validate_estimates,
     warn_refuted,
     warn_still_validation,
 )
-from sysid.diagnosis.warnings import (
+from sysid.judgement.warnings import (
     collect_warnings,
     find_delay_parameters,
     warn_noise_model,
     warn_time_limit,
 )
-from sysid.identifiability.exchange import describe_exchanges
-from sysid.identification.best_estimate import IslandEnd, find_best_estimate, is_refining
-from sysid.identification.budget import Budget
-from sysid.identification.deadline import Clock, Deadline
-from sysid.islands.run_state import RunState
 from sysid.minima.minima import mark_ambiguous
 from sysid.minima.search_evidence import assess_search, mark_unsettled, warn_unsettled
 from sysid.noise_models.noise_model_choice import resolve_noise_model

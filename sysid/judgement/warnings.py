@@ -6,9 +6,9 @@ import numpy as np
 
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.units import format_unit
-from sysid.diagnosis.suspects import DYNAMICS, describe_suspects, find_suspects
-from sysid.diagnosis.unrecorded_input import warn_unrecorded_input
 from sysid.identifiability.combinations import IdentifiableCombination
+from sysid.judgement.suspects import DYNAMICS, describe_suspects, find_suspects
+from sysid.judgement.unrecorded_input import warn_unrecorded_input
 from sysid.kernels.signals.past_reads import list_delayed_values
 from sysid.models.ties import collect_parameter_names
 from sysid.models.unit_checks import (

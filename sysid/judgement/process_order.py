@@ -29,7 +29,7 @@ from sysid.core.settings import FitSettings, Loss
 from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
-from sysid.diagnosis.warnings import find_delay_parameters
+from sysid.judgement.warnings import find_delay_parameters
 from sysid.models.catalogue.load import load_model
 from sysid.models.catalogue.process_family import Process, ProcessEntry, list_neighbouring_orders
 from sysid.models.model import name_initial_state, replace_substeps

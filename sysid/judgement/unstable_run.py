@@ -25,9 +25,9 @@ import numpy as np
 from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
-from sysid.diagnosis.fixed_start import compute_start_slopes, list_fixed_starts
-from sysid.diagnosis.input_hold import replace_holds, write_hold
-from sysid.diagnosis.warnings import find_delay_parameters
+from sysid.judgement.fixed_start import compute_start_slopes, list_fixed_starts
+from sysid.judgement.input_hold import replace_holds, write_hold
+from sysid.judgement.warnings import find_delay_parameters
 from sysid.minima.minima import scan_parameters
 from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.series import is_coloured, iterate_parts

@@ -25,7 +25,7 @@ import numpy as np
 
 from sysid.core.types import RANK_TOLERANCE, FloatArray
 from sysid.core.units import format_unit
-from sysid.diagnosis.unrecorded_input import compute_variances
+from sysid.judgement.unrecorded_input import compute_variances
 from sysid.kernels.signals.past_reads import is_difference
 from sysid.models.model import MAX_SUBSTEPS, replace_substeps
 from sysid.search.refine import refine_candidates
