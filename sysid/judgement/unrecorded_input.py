@@ -98,9 +98,7 @@ def _find_moves(problem: Problem, analysis: Analysis, assumed: BoolArray) -> lis
 
 def find_assumed_samples(problem: Problem, analysis: Analysis) -> list[BoolArray]:
     """Mark the samples of every output that read an input from before its recorded part."""
-    reach = _compute_longest_input_delay(
-        problem, {one.name: (one.value, one.value) for one in analysis.estimates}
-    )
+    reach = compute_reach(problem, analysis)
     return [
         channel.times < until
         for record, until in zip(
@@ -121,6 +119,12 @@ def _find_recorded_starts(problem: Problem, reach: float) -> list[float]:
         experiment.grid.start + reach - record.history_duration
         for record, experiment in zip(problem.records, problem.experiments, strict=True)
     ]
+
+
+def compute_reach(problem: Problem, analysis: Analysis) -> float:
+    """Compute how far (s) the time lags of inputs reach back at the estimate."""
+    spans = {one.name: (one.value, one.value) for one in analysis.estimates}
+    return _compute_longest_input_delay(problem, spans)
 
 
 def _compute_longest_input_delay(problem: Problem, spans: Mapping[str, Interval]) -> float:
@@ -172,9 +176,7 @@ def _to_theta(problem: Problem, analysis: Analysis) -> FloatArray:
 def _refit_without_assumed(problem: Problem, analysis: Analysis) -> FloatArray:
     """Fit the other samples, from the estimate (D,) on; return the estimate if that fails."""
     theta = _to_theta(problem, analysis)
-    reach = _compute_longest_input_delay(
-        problem, {one.name: (one.value, one.value) for one in analysis.estimates}
-    )
+    reach = compute_reach(problem, analysis)
     others = _select_recorded(problem, reach)
     if others is None:
         return theta
