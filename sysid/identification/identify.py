@@ -22,7 +22,8 @@ from sysid.identification.options import RunOptions
 from sysid.identification.request import IdentificationRequest, accept_fields
 from sysid.identification.run import advance_run, begin_run, is_finished
 from sysid.islands.run_state import RunState
-from sysid.judgement.warnings import warn_constant_outputs
+from sysid.judgement.agreement import find_constant_outputs
+from sysid.judgement.conclusions import list_warnings
 from sysid.models.catalogue.load import resolve_model
 from sysid.models.model import Model
 from sysid.models.model_delays import check_unused_settings
@@ -171,7 +172,7 @@ def identify_records(
     problem, validation_problem = problems = build_problems(model, prepared, fit)
     check_warm(options.warm, [parameter.name for parameter in problem.all_parameters])
     if tell is not None:
-        tell(warn_constant_outputs(problem))
+        tell(list_warnings(list(find_constant_outputs(problem))))
     load_in_background()  # the conclusion needs them
     state = begin_run(problem, algorithm, options.seed, options.warm)
     while not is_finished(algorithm, state):

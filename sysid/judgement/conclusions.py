@@ -9,7 +9,8 @@ from dataclasses import replace
 
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.judgement.levels import NOTABLE_MOVE
-from sysid.results.findings import Finding, Severity, Verdict
+from sysid.results.findings import Finding, Severity
+from sysid.results.verdict import Verdict
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
 
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")

@@ -5,8 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.judgement.explanations import actuator, constancy, history, reading, sensor, structure
+from sysid.judgement.explanations.noise import (
+    find_disagreement_of_frequencies,
+    find_noise,
+)
 from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE, STRONG_ODDS
 from sysid.judgement.residual_context import Candidate, ResidualContext
 from sysid.judgement.residual_model import ColumnFit
@@ -21,6 +26,7 @@ _PROPOSERS = (
     actuator.propose,
 )
 _MOST_FINDINGS = 3  # that are found beside each other
+_MOST_TOLD = 3  # moves in a sentence
 
 
 class _Scored(NamedTuple):
@@ -29,14 +35,26 @@ class _Scored(NamedTuple):
     gain: float
 
 
-def explain_residuals(context: ResidualContext) -> list[Finding]:
+class Explained(NamedTuple):
+    """Findings about residuals; `is_done`: whether they were looked for."""
+
+    findings: tuple[Finding, ...] = ()
+    is_done: bool = False
+
+    @property
+    def is_noise(self) -> bool:
+        """Whether no explanation moves an estimate: what is left is noise."""
+        return all(one.severity == "note" for one in self.findings)
+
+
+def explain_residuals(context: ResidualContext) -> Explained:
     """Explain the residuals of an estimate by the likeliest explanations, the largest gain first.
 
     The likeliest one is taken, then the likeliest beside it, as long as one gains clearly
     (stepwise by Schwarz's criterion).
     """
     if not _is_possible(context):
-        return []
+        return Explained()
     base = context.residual_model.without
     candidates = list(_list_candidates(context))
     taken = np.zeros((context.times.size, 0))
@@ -58,7 +76,10 @@ def explain_residuals(context: ResidualContext) -> list[Finding]:
         counted += best.candidate.counted
         base = best.fit
         candidates = [one.candidate for one in scored if one.gain > DEFECT_GAIN][1:]
-    return findings
+    findings += find_noise(context, base)
+    if not findings:
+        findings += find_disagreement_of_frequencies(context)
+    return Explained(tuple(findings), True)
 
 
 def _is_possible(context: ResidualContext) -> bool:
@@ -104,6 +125,7 @@ def _describe(
     text = f"{candidate.text}."
     if candidate.describe is not None:
         text += f" {candidate.describe(best.fit)}"
+    text += _tell_moves(context, moves)
     if rivals:
         others = dict.fromkeys(one.candidate.brief for one in rivals)
         text += f" As likely: {'; '.join(list(others)[:2])}."
@@ -122,3 +144,31 @@ def _describe(
 
 def _list_notable(moves: Sequence[Move]) -> set[str]:
     return {move.parameter for move in moves if abs(move.stderrs) > NOTABLE_MOVE}
+
+
+def _tell_moves(context: ResidualContext, moves: Sequence[Move]) -> str:
+    known = {one.name: one for one in context.analysis.estimates}
+    told = [
+        f"{move.parameter} = {plain_estimate(move.value, move.stderr)}"
+        f"{plain_unit(known[move.parameter].unit)} instead of {known[move.parameter].value:.4g}"
+        for move in moves[:_MOST_TOLD]
+        if abs(move.stderrs) > NOTABLE_MOVE
+    ]
+    return f" With that, about {', '.join(told)}." if told else ""
+
+
+def select_explanations(
+    explained: Sequence[Finding], refitted: Sequence[Finding]
+) -> tuple[Finding, ...]:
+    """Select among explanations by columns and those that were fitted in full, on one scale.
+
+    Each of them was compared with the model alone, so they compete. Those with strong evidence
+    against them, beside the likeliest one, are left out. What was found beside the likeliest one
+    stays with it.
+    """
+    first = max((one.gain or 0.0 for one in explained), default=0.0)
+    other = max((one.gain or 0.0 for one in refitted), default=0.0)
+    kept = [one for one in refitted if one.gain is None or (one.gain or 0.0) > first - STRONG_ODDS]
+    if other - first > STRONG_ODDS:
+        return tuple(kept)
+    return (*explained, *kept)

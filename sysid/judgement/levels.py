@@ -17,3 +17,14 @@ NOTABLE_MOVE = 1.0
 
 SEPARABLE = 2.0
 """Standard errors: a smaller time lag is not distinguishable from 0 (95 %)."""
+
+UNLIKELY_MOVE = 3.3
+"""Standard errors: two consistent estimates differ by more in one of a thousand records (normal
+quantile)."""
+
+UNLIKELY = 1e-3
+"""Probability of residuals under a true model: below it, a test has failed clearly. One in a
+thousand records is hedged for nothing."""
+
+SOLVER_SHARE = 1e-5
+"""Of the output: smaller residuals are the errors of the integration, and no noise."""

@@ -125,12 +125,12 @@ class ResidualModel:
             twice += (own.size - first) * np.log(one.innovation_variance)
             twice += first * np.log(one.variance)
         spread = float(innovations @ innovations) / max(n - k, 1)
-        inverse = np.linalg.inv(products[:k, :k] + _RIDGE * np.eye(k)) if k else np.zeros((0, 0))
+        inverse = _invert_diagonal(products[:k, :k])
         used = columns.shape[1] + counted + sum(one.weights.size for one in noise)
         return ColumnFit(
             twice + used * np.log(max(n, 2)),
             coefficients / scale,
-            np.sqrt(np.maximum(np.diag(inverse), 0.0) * spread) / scale,
+            np.sqrt(np.maximum(inverse, 0.0) * spread) / scale,
             noise,
             innovations,
         )
@@ -175,4 +175,15 @@ def _solve(products: FloatArray) -> FloatArray:
     k = products.shape[0] - 1
     scale = np.sqrt(np.maximum(np.diag(products)[:k], np.finfo(float).tiny))
     matrix = products[:k, :k] / np.outer(scale, scale) + _RIDGE * np.eye(k)
-    return np.asarray(np.linalg.solve(matrix, products[:k, k] / scale) / scale)
+    right = products[:k, k] / scale
+    try:
+        return np.asarray(np.linalg.solve(matrix, right) / scale)
+    except np.linalg.LinAlgError:  # columns that rounding makes equal
+        return np.asarray(np.linalg.pinv(matrix, hermitian=True) @ right / scale)
+
+
+def _invert_diagonal(products: FloatArray) -> FloatArray:
+    """Compute the diagonal (k,) of the inverse of normal equations (k, k)."""
+    scale = np.sqrt(np.maximum(np.diag(products), np.finfo(float).tiny))
+    matrix = products / np.outer(scale, scale) + _RIDGE * np.eye(scale.size)
+    return np.asarray(np.diag(np.linalg.pinv(matrix, hermitian=True)) / scale**2)

@@ -11,7 +11,6 @@ from typing import Literal
 
 from sysid.uncertainty.estimates import EstimateStatus
 
-Trust = Literal["trustworthy", "limited", "not trustworthy"]
 Severity = Literal["note", "caution", "serious"]
 Family = Literal[
     "constancy",
@@ -103,22 +102,6 @@ class Finding:
     def sentences(self) -> str:
         """The text with the advice."""
         return f"{self.text} {self.advice}".rstrip()
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """Whether the estimates of a result can be relied on.
-
-    Attributes
-    ----------
-    trust : {"trustworthy", "limited", "not trustworthy"}
-        Limited: the estimates hold but for those that the text names, or under its condition.
-    text : str
-        The verdict in words, such as “trustworthy but for L: L changes at about 98 s”.
-    """
-
-    trust: Trust
-    text: str
 
 
 def note(explanation: str, family: Family, text: str) -> Finding:

@@ -6,6 +6,7 @@ States that start at a number or at a measured value have the slopes of the outp
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -25,27 +26,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
     problem = context.problem
     if problem.prediction != "simulation":
         return
-    reach = compute_reach(problem, context.analysis)
-    if reach > 0:
-        for channel in context.moving_inputs:
-            columns = []
-            for span in range(_SPANS):
-                try:
-                    other = context.simulate(_change_history(context, channel.name, reach, span))
-                except SysidError:
-                    continue
-                moved = other - context.simulated
-                if np.all(np.isfinite(moved)) and moved.any():
-                    columns.append(moved)
-            if columns:
-                yield Candidate(
-                    "input before the record",
-                    "history",
-                    context.weigh(np.column_stack(columns)),
-                    f"{channel.name} moved before the record",
-                    f"{channel.name} was not at its first value before the record, as is assumed",
-                    "Begin the record earlier, or leave its first samples out with skip.",
-                )
+    yield from _propose_inputs(context)
     states = list_fixed_starts(problem)
     if 0 < len(states) <= _MOST_STATES:
         noise = float(np.sqrt(np.mean(np.square(context.residual_model.residuals))))
@@ -58,6 +39,27 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             f"the record does not start where the model says that {', '.join(states)} does",
             "Use initial: free.",
         )
+
+
+def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:
+    """Propose that an input was elsewhere before its first sample."""
+    reach = compute_reach(context.problem, context.analysis)
+    for channel in context.moving_inputs if reach > 0 else ():
+        columns = []
+        for span in range(_SPANS):
+            with suppress(SysidError):
+                other = context.simulate(_change_history(context, channel.name, reach, span))
+                columns.append(other - context.simulated)
+        moved = [column for column in columns if np.all(np.isfinite(column)) and column.any()]
+        if moved:
+            yield Candidate(
+                "input before the record",
+                "history",
+                context.weigh(np.column_stack(moved)),
+                f"{channel.name} moved before the record",
+                f"{channel.name} was not at its first value before the record, as is assumed",
+                "Begin the record earlier, or leave its first samples out with skip.",
+            )
 
 
 def _change_history(context: ResidualContext, name: str, reach: float, span: int) -> list[Record]:
