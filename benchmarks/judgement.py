@@ -36,6 +36,7 @@ from service.cli.common import apply_setting
 from service.jobs.job_schemas import JobIn
 from service.jobs.to_core import read_run_settings
 from sysid.core.errors import SysidError
+from sysid.core.text import rewrite_settings
 from sysid.identification.identify import identify_records
 from sysid.identification.identify_arguments import read_records
 from sysid.models.catalogue.load import resolve_model
@@ -188,7 +189,7 @@ def _describe_finding(finding: Any) -> dict[str, Any]:
     return {
         "explanation": finding.explanation,
         "family": finding.family,
-        "gain": float(finding.gain),
+        "gain": finding.gain,
         "moves": moves,
         "severity": finding.severity,
         "brief": finding.brief,
@@ -199,14 +200,17 @@ def _describe_finding(finding: Any) -> dict[str, Any]:
 
 def read_advice(found: Identification) -> tuple[str, ...]:
     """Read the verdict's first advice as settings; `model=NAME` is another model."""
-    findings = getattr(found, "findings", ())
-    if findings:
-        return read_settings(str(findings[0].advice or ""))
-    orders = found.order_comparison
-    advises = any("Use that model" in reason.text for reason in found.verdict.reasons[:1])
-    if advises and orders is not None and orders.preferred_model is not None:
-        return (f"model={orders.preferred_model}",)
-    return ()
+    if found.verdict.trust == "trustworthy":
+        return ()
+    advice = found.findings[0].advice
+    models = re.findall(r"the model (\w+)", advice)
+    typed = rewrite_settings(advice, _write_options)
+    return (*(f"model={name}" for name in models), *read_settings(typed))
+
+
+def _write_options(field: str, entries: Mapping[str, str]) -> str:
+    prefix = f"{field}." if field else ""
+    return " ".join(f"--set {prefix}{name}={value}" for name, value in entries.items())
 
 
 def read_settings(text: str) -> tuple[str, ...]:
@@ -256,7 +260,7 @@ def tell_each(answer: Answer) -> str:
         for name, one in answer.estimates.items()
     )
     findings = "; ".join(
-        f"{one['family']}/{one['explanation']} gain {one['gain']:.0f}, moves "
+        f"{one['family']}/{one['explanation']} gain {one['gain'] or 0.0:.0f}, moves "
         + ", ".join(f"{name} {move[1]:+.1f}" for name, move in one["moves"].items())
         for one in answer.findings
     )
