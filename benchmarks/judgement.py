@@ -23,7 +23,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 import numpy as np
@@ -198,13 +198,13 @@ def is_detectable(case: Case, found: Identification) -> bool:
     kind = case.kind
     if kind.group in ("white", "coloured") or kind.detectable == "never":
         return False
-    if kind.detectable == "always" or not case.noise_sd:
+    if kind.group == "dirty" or kind.detectable == "always":
         return True
     ((fitted,),) = found.simulated
     missed = (case.clean[-fitted.size :] - fitted) / case.noise_sd
     missed = missed[np.isfinite(missed)]
     free = sum(one.is_free for one in found.parameters)
-    return float(np.sum(missed**2)) - free > 10.0 + 2.0 * np.log(missed.size)
+    return bool(np.sum(missed**2) - free > 10.0 + 2.0 * np.log(missed.size))
 
 
 def _describe_finding(finding: Any) -> dict[str, Any]:
@@ -234,11 +234,7 @@ def read_advice(found: Identification) -> tuple[str, ...]:
 
 
 def read_settings(text: str) -> tuple[str, ...]:
-    """Read the options of `lagid identify` in a text.
-
-    >>> read_settings("Use --model sopdt, or --set loss.noise_model=ar1.")
-    ('model=sopdt', 'loss.noise_model=ar1')
-    """
+    """Read the options of `lagid identify` in a text."""
     names = {"model": "model", "noise-model": "loss.noise_model"}
     settings = []
     pattern = r"--(set|model|noise-model)[ =]('[^']*'|\"[^\"]*\"|[^\s`,;]+)"
@@ -347,7 +343,11 @@ def print_kinds(answers: Sequence[Answer]) -> None:
 
 
 def share_row(
-    title: str, those: Sequence[object], of: Sequence[object], bar: float | None, relation: Any
+    title: str,
+    those: Sequence[object],
+    of: Sequence[object],
+    bar: float | None,
+    relation: Literal["<=", ">="],
 ) -> Row | Skipped:
     """A share in per cent, or that there was nothing to count."""
     if not of:
@@ -509,8 +509,7 @@ def compare_halves(folder: Path) -> list[Row | Skipped]:
             identify_as_command(source, cut_half(recording, number), changes) for number in (0, 1)
         ]
         apart = list(_compare_pair(title, *halves))
-        name = f"{title}: identified in both halves, over {APART:g} errors apart"
-        rows.append(Row(name, sum(apart), "", 0))
+        rows.append(Row(f"{title}: identified twice, {APART:g} errors apart", sum(apart), "", 0))
     return rows
 
 
@@ -524,7 +523,8 @@ def _compare_pair(title: str, first: Identification, second: Identification) -> 
         errors = abs(one.value - other.value) / float(np.hypot(one.stderr, other.stderr))
         print(
             f"| {title} | {one.name} | {one.value:.4g} ± {one.stderr:.2g} {one.status} "
-            f"| {other.value:.4g} ± {other.stderr:.2g} {other.status} | {errors:.1f} | {verdicts} |",
+            f"| {other.value:.4g} ± {other.stderr:.2g} {other.status} "
+            f"| {errors:.1f} | {verdicts} |",
             flush=True,
         )
         verdicts = ""

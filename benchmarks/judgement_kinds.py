@@ -38,6 +38,24 @@ LEVELLING = ("fopdt", "sopdt")
 OWN = ("tank", "feedback", "valve", "cooler")
 ALL = (*PROCESSES, *OWN)
 DRIVES = ("steps", "prbs", "step", "smooth")
+FAMILIES = frozenset(
+    [
+        "constancy",
+        "clocks",
+        "sensor",
+        "actuator",
+        "variance",
+        "input",
+        "reading",
+        "start",
+        "history",
+        "structure",
+        "noise",
+        "search",
+        "record",
+    ]
+)
+"""Families of explanations; other words in the reasons of a kind are names of explanations."""
 LIVELY = ("steps", "prbs", "smooth")
 HELD = ("steps", "prbs")
 MANY = ("steps", "smooth")
@@ -336,7 +354,7 @@ def draw_moment(scene: Scene, low: float = 0.35, high: float = 0.65) -> float:
 
 def change_value(scene: Scene, name: str, factor: float, *, slowly: bool = False) -> None:
     """Let a parameter change by a factor, at a moment or along a straight line."""
-    before = scene.plant.truth[name]
+    before, factor = scene.plant.truth[name], float(factor)
     if slowly:
         share = np.clip(scene.clock / scene.duration, 0.0, 1.0)
     else:
@@ -1042,7 +1060,7 @@ def missing_input_recorded(scene: Scene) -> None:
 def periodic_input(scene: Scene) -> None:
     """Cut from a longer record under an exactly periodic input."""
     every = max(6, round(scene.random.uniform(1.5, 3.0) * scene.plant.slow / scene.plant.period))
-    scene.before = 40 * every
+    scene.before = 12 * every
     wave = np.arange(scene.before + 400) % every < 0.4 * every
     scene.shape = np.where(wave, 0.8, -0.6)
 
@@ -1075,7 +1093,7 @@ def switch_early(scene: Scene) -> Callable[[FloatArray], FloatArray]:
     return switch
 
 
-@kind("reading input", drives=("steps",))
+@kind("reading input", drives=("steps",), detectable="always")
 def block_means(scene: Scene) -> None:
     """The log has means of both channels, and the input switches at any time."""
     shift = float(scene.random.choice([0.0, 1.0]))
@@ -1102,7 +1120,7 @@ def switched_between_samples(scene: Scene) -> None:
     scene.actuator = switch_early(scene)
 
 
-@kind("reading record noise structure", drives=("steps", "smooth"))
+@kind("reading record noise structure", drives=("steps", "smooth"), detectable="always")
 def resampled(scene: Scene) -> None:
     """The log was interpolated to a denser grid."""
     dense = scene.plant.period / scene.random.uniform(1.7, 3.3)
@@ -1116,7 +1134,7 @@ def resampled(scene: Scene) -> None:
     scene.log = interpolate
 
 
-@kind("reading record noise sensor variance", drives=("steps", "smooth"))
+@kind("reading record noise sensor variance", drives=("steps", "smooth"), detectable="always")
 def repeated_rows(scene: Scene) -> None:
     """Each row is written three times, at its own stamp."""
 
