@@ -184,7 +184,7 @@ def _build_identification(
             *find_contradictions(problem, metrics, validated, estimates),
             *find_misled_run(estimates, ahead),
             *select_explanations(
-                () if is_of_the_solver else explained.findings,
+                () if is_of_the_solver or feedback else explained.findings,
                 [
                     *find_other_orders(orders, problem.model.name, estimates),
                     *find_other_readings(problem, holds, doubts, estimates, rms),
