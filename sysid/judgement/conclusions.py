@@ -13,6 +13,8 @@ from sysid.results.findings import Finding, Severity
 from sysid.results.verdict import Verdict
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
 
+_MOST_REASONS = 2  # of an estimate, and in a verdict
+
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
 _RANKS: tuple[EstimateStatus, ...] = (
     "identified",
@@ -49,16 +51,26 @@ def conclude_estimates(
 
 
 def _conclude_estimate(estimate: Estimate, findings: Sequence[Finding]) -> Estimate:
-    if estimate.status not in _RANKS:
+    against = [one for one in findings if _is_against(one, estimate)]
+    if not against or estimate.status not in _RANKS:
         return estimate
-    against = [one for one in findings if estimate.name in one.parameters and one.status in _RANKS]
-    if not against:
-        return estimate
-    status = max((one.status for one in against), key=_RANKS.index)
-    if _RANKS.index(status) <= _RANKS.index(estimate.status):
-        return estimate
-    first = next(one for one in against if one.status == status)
-    return replace(estimate, status=status, reason=_explain(estimate, first))
+    statuses = (estimate.status, *(one.status for one in against))
+    known = "" if estimate.status == "identified" else estimate.reason
+    found = [_explain(estimate, one) for one in against if one.status != estimate.status]
+    reasons = dict.fromkeys(reason for reason in (known, *found) if reason)
+    return replace(
+        estimate,
+        status=max(statuses, key=_RANKS.index),
+        reason="; ".join(list(reasons)[:_MOST_REASONS]),
+    )
+
+
+def _is_against(finding: Finding, estimate: Estimate) -> bool:
+    """Whether a finding makes an estimate doubtful; a serious one without names does all."""
+    if finding.severity == "note" or finding.status not in _RANKS:
+        return False
+    is_for_all = finding.severity == "serious" and not finding.parameters
+    return estimate.name in finding.parameters or (is_for_all and estimate.is_free)
 
 
 def _explain(estimate: Estimate, finding: Finding) -> str:
@@ -77,7 +89,7 @@ def conclude_verdict(
     """Conclude the verdict from findings in their order, and from the statuses that they gave.
 
     A result is not trustworthy if a finding says so, or if findings leave none of the parameters
-    that the model declares identified.
+    that the model declares identified. The text names the first of the most severe findings.
 
     Examples
     --------
@@ -93,15 +105,16 @@ def conclude_verdict(
     first = findings[0] if findings else None
     if first is None or first.severity == "note":
         return Verdict("trustworthy", "trustworthy")
+    briefs = dict.fromkeys(one.brief for one in findings if one.severity == first.severity)
+    brief = "; ".join(list(briefs)[:_MOST_REASONS])
     names = set(declared)
     free = [one for one in estimates if one.is_free and one.name in names]
     doubtful = [one.name for one in free if one.status != "identified"]
     if first.severity == "serious" or (free and len(doubtful) == len(free)):
-        brief = first.brief
-        text = brief if brief.startswith("not ") else f"not trustworthy: {brief}"
-        return Verdict("not trustworthy", text)
+        is_told = brief.startswith("not ")
+        return Verdict("not trustworthy", brief if is_told else f"not trustworthy: {brief}")
     but = f" but for {join_names(doubtful)}:" if doubtful else ", but"
-    return Verdict("limited", f"trustworthy{but} {first.brief}")
+    return Verdict("limited", f"trustworthy{but} {brief}")
 
 
 def list_warnings(findings: Sequence[Finding]) -> tuple[str, ...]:
