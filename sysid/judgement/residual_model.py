@@ -128,7 +128,7 @@ class ResidualModel:
         inverse = _invert_diagonal(products[:k, :k])
         used = columns.shape[1] + counted + sum(one.weights.size for one in noise)
         return ColumnFit(
-            twice + used * np.log(max(n, 2)),
+            float(twice + used * np.log(max(n, 2))),
             coefficients / scale,
             np.sqrt(np.maximum(inverse, 0.0) * spread) / scale,
             noise,
