@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from sysid.core.text import join_names, plain_estimate, plain_unit
-from sysid.judgement.levels import NOTABLE_MOVE
+from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE
 from sysid.results.findings import Finding, Severity
 from sysid.results.verdict import Verdict
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
@@ -16,6 +16,7 @@ from sysid.uncertainty.estimates import Estimate, EstimateStatus
 _MOST_REASONS = 2  # of an estimate, and in a verdict
 
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
+_OF_NOISE = ("outliers", "unequal variance", "coloured noise")
 _RANKS: tuple[EstimateStatus, ...] = (
     "identified",
     "dependent",
@@ -27,20 +28,21 @@ _RANKS: tuple[EstimateStatus, ...] = (
 
 
 def order_findings(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Order findings: the most severe first, and among these the largest gain.
+    """Order findings: explanations with a clear gain, then what is severe, then notes.
 
-    Findings that nothing is compared for follow those with a gain, in their order.
+    Explanations of what the model leaves come before those of its noise. Within each group the
+    largest gain is first; what is not compared follows in its order.
     """
     return tuple(
-        sorted(
-            findings,
-            key=lambda one: (
-                _SEVERITIES.index(one.severity),
-                one.gain is None,
-                -(one.gain or 0.0),
-            ),
-        )
+        sorted(findings, key=lambda one: (_find_group(one), one.gain is None, -(one.gain or 0.0)))
     )
+
+
+def _find_group(finding: Finding) -> int:
+    is_clear = finding.gain is not None and finding.gain > DEFECT_GAIN
+    if is_clear and finding.explanation not in _OF_NOISE:
+        return 0
+    return 1 + _SEVERITIES.index(finding.severity)
 
 
 def conclude_estimates(
@@ -89,7 +91,7 @@ def conclude_verdict(
     """Conclude the verdict from findings in their order, and from the statuses that they gave.
 
     A result is not trustworthy if a finding says so, or if findings leave none of the parameters
-    that the model declares identified. The text names the first of the most severe findings.
+    that the model declares identified. The text names the first two causes of doubt.
 
     Examples
     --------
@@ -102,19 +104,30 @@ def conclude_verdict(
     >>> conclude_verdict([gain, replace(lag, status="dependent")], [moved], ["K", "L"]).text
     'trustworthy but for L: the data prefer sopdt'
     """
-    first = findings[0] if findings else None
-    if first is None or first.severity == "note":
+    severe = [one for one in findings if one.severity != "note"]
+    if not severe:
         return Verdict("trustworthy", "trustworthy")
-    briefs = dict.fromkeys(one.brief for one in findings if one.severity == first.severity)
-    brief = "; ".join(list(briefs)[:_MOST_REASONS])
+    cause = ", and ".join(_list_causes(findings[0], severe))
+    is_serious = any(one.severity == "serious" for one in severe)
     names = set(declared)
     free = [one for one in estimates if one.is_free and one.name in names]
     doubtful = [one.name for one in free if one.status != "identified"]
-    if first.severity == "serious" or (free and len(doubtful) == len(free)):
-        is_told = brief.startswith("not ")
-        return Verdict("not trustworthy", brief if is_told else f"not trustworthy: {brief}")
+    if is_serious or (free and len(doubtful) == len(free)):
+        text = cause if cause.startswith("not ") else f"not trustworthy: {cause}"
+        return Verdict("not trustworthy", text)
     but = f" but for {join_names(doubtful)}:" if doubtful else ", but"
-    return Verdict("limited", f"trustworthy{but} {brief}")
+    return Verdict("limited", f"trustworthy{but} {cause}")
+
+
+def _list_causes(first: Finding, severe: Sequence[Finding]) -> list[str]:
+    """List the briefs that a verdict names: the first cause of doubt, and one more.
+
+    That is a note which explains the data better, or else the most severe of the others.
+    """
+    others = sorted(severe[1:], key=lambda one: _SEVERITIES.index(one.severity))
+    notes = [first] if first.severity == "note" else []
+    briefs = dict.fromkeys(one.brief for one in (severe[0], *notes, *others))
+    return list(briefs)[:_MOST_REASONS]
 
 
 def list_warnings(findings: Sequence[Finding]) -> tuple[str, ...]:

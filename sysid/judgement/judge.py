@@ -24,15 +24,20 @@ _PROPOSERS = (
     history.propose,
     reading.propose,
     actuator.propose,
+    actuator.propose_loads,
 )
 _MOST_FINDINGS = 3  # that are found beside each other
 _MOST_TOLD = 3  # moves in a sentence
+_MOST_REFITTED = 3  # explanations that are fitted in full
 
 
 class _Scored(NamedTuple):
+    """A candidate with its gain; `moves` are those of a full fit, if there was one."""
+
     candidate: Candidate
     fit: ColumnFit
     gain: float
+    moves: tuple[Move, ...] | None = None
 
 
 class Explained(NamedTuple):
@@ -62,6 +67,8 @@ def explain_residuals(context: ResidualContext) -> Explained:
     findings: list[Finding] = []
     while len(findings) < _MOST_FINDINGS:
         scored = _score(context, candidates, taken, counted, base.criterion)
+        if not findings:
+            scored = _refit_finalists(context, scored, base.criterion)
         if not scored or scored[0].gain <= DEFECT_GAIN:
             break
         best = scored[0]
@@ -114,14 +121,41 @@ def _score(
     return sorted(scored, key=lambda one: -one.gain)
 
 
+def _refit_finalists(
+    context: ResidualContext, scored: Sequence[_Scored], criterion: float
+) -> list[_Scored]:
+    """Fit in full the likeliest explanations of which each is another record.
+
+    They may move the parameters by far more than a linear step.
+    """
+    refitted, tried = list(scored), dict[str, int]()
+    for position, one in enumerate(scored):
+        name = one.candidate.explanation
+        if len(tried) == _MOST_REFITTED or one.gain <= 0.0:
+            break
+        if one.candidate.records is None or name in tried:
+            continue
+        tried[name] = position
+        found = context.refit(one.candidate.records)
+        if found is None:
+            continue
+        used = (1 + one.candidate.counted) * np.log(max(context.times.size, 2))
+        gain = criterion - found.criterion - used
+        if gain > one.gain - STRONG_ODDS:
+            refitted[position] = one._replace(gain=max(gain, one.gain), moves=found.moves)
+    return sorted(refitted, key=lambda one: -one.gain)
+
+
 def _describe(
     context: ResidualContext, best: _Scored, base: ColumnFit, rivals: Sequence[_Scored]
 ) -> Finding:
     candidate = best.candidate
-    moves = context.compute_moves(best.fit, base)
-    notable = {move.parameter for move in moves if abs(move.stderrs) > NOTABLE_MOVE}
+    moves = best.moves or context.compute_moves(best.fit, base, candidate.varies)
+    notable = _list_notable(moves)
     for rival in rivals:
-        notable |= _list_notable(context.compute_moves(rival.fit, base))
+        notable |= _list_notable(context.compute_moves(rival.fit, base, rival.candidate.varies))
+    if candidate.is_vague:
+        notable = {move.parameter for move in moves}
     text = f"{candidate.text}."
     if candidate.describe is not None:
         text += f" {candidate.describe(best.fit)}"
@@ -166,6 +200,8 @@ def select_explanations(
     against them, beside the likeliest one, are left out. What was found beside the likeliest one
     stays with it.
     """
+    names = {one.explanation for one in explained}
+    refitted = [one for one in refitted if one.explanation not in names or not one.parameters]
     first = max((one.gain or 0.0 for one in explained), default=0.0)
     other = max((one.gain or 0.0 for one in refitted), default=0.0)
     kept = [one for one in refitted if one.gain is None or (one.gain or 0.0) > first - STRONG_ODDS]

@@ -1,24 +1,33 @@
 """What explanations of residuals start from: residuals, sensitivities, and the model itself."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.core.units import format_unit
+from sysid.data.interpolation import interpolate_channel
 from sysid.data.records import Channel, Record
+from sysid.judgement.fixed_start import compute_start_slopes, list_fixed_starts
 from sysid.judgement.residual_model import ColumnFit, Noise, ResidualModel
 from sysid.kernels.signals.past_reads import list_delayed_values
 from sysid.models.ties import collect_parameter_names
 from sysid.residuals.series import ResidualPart, iterate_parts
 from sysid.results.findings import Family, Move
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale
+from sysid.uncertainty.sensitivities import compute_sensitivities
 
 _EDGE_SHARE = 0.05  # of an experiment at either end, in which no change is looked for
+_REFIT_STEPS = 12  # of least squares, from the estimate
+_AFTER = 0.01  # of a period: a held input has jumped then
+_MOST_STATES = 8  # whose starts are looked at
+_SHOCKS = 3  # innovations that are looked at
 _OWN_SHARE = 1e-6  # of a column that no parameter explains: less says nothing
 
 
@@ -35,7 +44,14 @@ class Candidate:
     counted : int
         Parameters beside the coefficients, such as a position that was chosen.
     describe : callable or None
-        Completes the text from the coefficients (q,), and from values of the parameters.
+        Completes the text from the fit.
+    varies : tuple of int and two floats, or None
+        Number of the parameter that is not one value, and the least and largest share of the last
+        coefficient that is added to it.
+    records : sequence of Record, or None
+        Records with which the model is fitted again, for moves that are not linear.
+    is_vague : bool
+        Whether it leaves open what the model lacks: then no parameter is safe.
     """
 
     explanation: str
@@ -46,6 +62,9 @@ class Candidate:
     advice: str = ""
     counted: int = 0
     describe: Callable[[ColumnFit], str] | None = None
+    varies: tuple[int, float, float] | None = None
+    records: Sequence[Record] | None = None
+    is_vague: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,27 +143,57 @@ class ResidualContext:
         columns = values[:, None] if values.ndim == 1 else values
         return self.weight[:, None] * columns
 
-    def compute_moves(self, fit: ColumnFit, base: ColumnFit) -> tuple[Move, ...]:
-        """Compute how far a fit moves the parameters from another one, the furthest first."""
+    def compute_moves(
+        self, fit: ColumnFit, base: ColumnFit, varies: tuple[int, float, float] | None = None
+    ) -> tuple[Move, ...]:
+        """Compute how far a fit moves the parameters from another one, the furthest first.
+
+        A parameter that varies moves to that of its values that is furthest.
+        """
         d = self.theta.size
         scale = compute_physical_scale(self.problem, self.theta)
         steps = (fit.coefficients[:d] - base.coefficients[:d]) * scale
         errors = fit.errors[:d] * scale
+        if varies is not None:
+            number, *shares = varies
+            change = float(fit.coefficients[-1] * scale[number])
+            ends = [float(steps[number]) + share * change for share in shares]
+            steps[number] = max(ends, key=abs)
         known = {estimate.name: estimate for estimate in self.analysis.estimates}
-        moves = []
-        for number, name in self.declared:
-            stderr = known[name].stderr
-            if stderr:
-                step = float(steps[number])
-                moves.append(
-                    Move(
-                        name,
-                        float(self.theta[number]) + step,
-                        float(errors[number]),
-                        step / stderr,
-                    )
-                )
-        return tuple(sorted(moves, key=lambda move: -abs(move.stderrs)))
+        return _order_moves(
+            Move(
+                name,
+                float(self.theta[number] + steps[number]),
+                float(errors[number]),
+                float(steps[number] / stderr),
+            )
+            for number, name in self.declared
+            if (stderr := known[name].stderr)
+        )
+
+    def refit(self, records: Sequence[Record]) -> "Refitted | None":
+        """Fit the model again to other records; None if that fails."""
+        problem = self.problem.rebuild(records=records, weights=self.problem.output_weights)
+        (end,) = refine_candidates(problem, [self.theta], _REFIT_STEPS * (self.theta.size + 1))
+        if end is None:
+            return None
+        sensitivities = compute_sensitivities(problem, end.theta)
+        self.spent.extend([1] * (end.evaluations + sensitivities.evaluations))
+        fit = ResidualModel(-sensitivities.residuals, sensitivities.columns, self.parts).without
+        scale = compute_physical_scale(problem, end.theta)
+        values = end.theta + fit.coefficients * scale
+        known = {estimate.name: estimate for estimate in self.analysis.estimates}
+        moves = _order_moves(
+            Move(
+                name,
+                float(values[number]),
+                float(fit.errors[number] * scale[number]),
+                float(values[number] - self.theta[number]) / stderr,
+            )
+            for number, name in self.declared
+            if (stderr := known[name].stderr)
+        )
+        return Refitted(fit.criterion, moves)
 
     def simulate(self, records: Sequence[Record]) -> FloatArray:
         """Simulate the scored values (n,) with other inputs."""
@@ -175,6 +224,24 @@ class ResidualContext:
         return records
 
     @cached_property
+    def fixed_start_slopes(self) -> list[FloatArray]:
+        """Slopes (n, E) of the outputs in each start that is not estimated; none if they are many.
+
+        Not of predictions one step ahead, which forget their start.
+        """
+        states = list_fixed_starts(self.problem)
+        if self.problem.prediction != "simulation" or len(states) > _MOST_STATES:
+            return []
+        noise = float(np.sqrt(np.mean(np.square(self.residual_model.residuals))))
+        self.spent.extend([1] * 3 * len(states))
+        return [compute_start_slopes(self.problem, self.theta, one, noise) for one in states]
+
+    @cached_property
+    def inputs(self) -> list[str]:
+        """Names of the inputs of the model."""
+        return [signal.name for signal in self.problem.model.inputs]
+
+    @cached_property
     def moving_inputs(self) -> list[Channel]:
         """Inputs of the model that move, as they are in the first record in which they do."""
         names = {signal.name for signal in self.problem.model.inputs}
@@ -184,6 +251,22 @@ class ResidualContext:
                 if channel.name in names and np.ptp(channel.values) > 0:
                     found.setdefault(channel.name, channel)
         return list(found.values())
+
+    def read_input(self, name: str, lag: float = 0.0) -> FloatArray:
+        """Read an input at the times (n,) of the samples, `lag` periods before.
+
+        A held input is read after its jump.
+        """
+        values = np.zeros(self.times.size)
+        for part in self.parts:
+            period = float(np.ptp(part.times)) / max(part.times.size - 1, 1)
+            for channel in self.problem.records[part.experiment].inputs:
+                if channel.name == name:
+                    after = _AFTER if channel.effective_hold == "zero" else 0.0
+                    values[part.rows] = interpolate_channel(
+                        channel, part.times + (after - lag) * period
+                    )
+        return values
 
     def find_breaks(self, column: FloatArray) -> list[tuple[float, FloatArray, str]]:
         """Find where a column (n,) most likely begins to count, under white and coloured noise.
@@ -209,6 +292,11 @@ class ResidualContext:
                 moment = float(self.times[self._order[best]])
                 found[best] = (moment, late, self._describe_moment(best, moment))
         return list(found.values())
+
+    def find_shocks(self) -> list[int]:
+        """Find the largest innovations, as numbers of samples."""
+        sizes = np.abs(self.residual_model.without.innovations)
+        return np.argsort(-sizes)[:_SHOCKS].tolist()
 
     def _describe_moment(self, position: int, moment: float) -> str:
         experiment = int(self._experiments[self._order[position]])
@@ -275,6 +363,17 @@ class ResidualContext:
                     rows[part.rows] = True
             if rows.any():
                 yield output.name, rows, format_unit(output.unit)
+
+
+class Refitted(NamedTuple):
+    """A model fitted again in full: Schwarz's criterion, and the moves of its parameters."""
+
+    criterion: float
+    moves: tuple[Move, ...]
+
+
+def _order_moves(moves: Iterable[Move]) -> tuple[Move, ...]:
+    return tuple(sorted(moves, key=lambda move: -abs(move.stderrs)))
 
 
 def find_delay_parameters(problem: Problem) -> set[str]:

@@ -36,8 +36,9 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
         for word, (hold, change, text) in others.items():
             if change is _keep and hold == channel.effective_hold:
                 continue
+            records = context.replace_input(name, change, hold=hold)
             try:
-                other = context.simulate(context.replace_input(name, change, hold=hold))
+                other = context.simulate(records)
             except SysidError:
                 continue
             moved = other - context.simulated
@@ -50,6 +51,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                     f"{name} is better read {word}",
                     f"the data say that {name} {text}",
                     setting,
+                    records=records,
                 )
     yield from _propose_means(context)
 

@@ -132,7 +132,7 @@ def _propose_old_readings(
         if before.any():
             yield Candidate(
                 "filter of a sensor",
-                "sensor",
+                "structure",
                 context.weigh(before),
                 f"{name} is filtered",
                 f"{name} is a mean of about {samples} samples, or is filtered before it is stored",
