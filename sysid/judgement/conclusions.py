@@ -120,14 +120,15 @@ def conclude_verdict(
 
 
 def _list_causes(first: Finding, severe: Sequence[Finding]) -> list[str]:
-    """List the briefs that a verdict names: the first cause of doubt, and one more.
+    """List the briefs that a verdict names: the likeliest cause of doubt, and one more.
 
-    That is a note which explains the data better, or else the most severe of the others.
+    That is the most severe one, then a note that explains the data better, then the next.
     """
-    others = sorted(severe[1:], key=lambda one: _SEVERITIES.index(one.severity))
+    worst = min(severe, key=lambda one: _SEVERITIES.index(one.severity))
     notes = [first] if first.severity == "note" else []
-    briefs = dict.fromkeys(one.brief for one in (severe[0], *notes, *others))
-    return list(briefs)[:_MOST_REASONS]
+    return list(dict.fromkeys(one.brief for one in (severe[0], worst, *notes, *severe)))[
+        :_MOST_REASONS
+    ]
 
 
 def list_warnings(findings: Sequence[Finding]) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from sysid.judgement.conclusions import (
     list_warnings,
     order_findings,
 )
+from sysid.judgement.levels import DEFECT_GAIN
 from sysid.results.findings import Finding, Move, Severity
 from sysid.results.verdict import Trust, Verdict
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
@@ -102,21 +103,32 @@ def test_the_order_of_findings_does_not_matter(
 
 
 @given(ESTIMATES, draw_findings(least=1))
-def test_the_reason_is_the_largest_gain_among_the_most_severe(
+def test_a_verdict_names_the_largest_clear_gain_and_the_most_severe_doubt(
     estimates: list[Estimate], findings: list[Finding]
 ) -> None:
     _, verdict = conclude(estimates, findings)
-    worst = min((one.severity for one in findings), key=SEVERITIES.index)
-    first = max(
-        (one for one in findings if one.severity == worst),
-        key=lambda one: float("-inf") if one.gain is None else one.gain,
-    )
-    if worst == "note":
+    severe = [one for one in findings if one.severity != "note"]
+    if not severe:
         assert verdict == Verdict("trustworthy", "trustworthy")
         return
-    assert verdict.trust != "trustworthy"
-    assert verdict.text.partition(";")[0].endswith(first.brief)
+    briefs = verdict.text.rpartition(": ")[2].rpartition("but ")[2].split(", and ")
+    named = [one for brief in briefs for one in findings if one.brief == brief]
+    assert len(named) == len(briefs) == min(len(severe) + has_clear_note(findings), 2)
+    clear = [one for one in severe if (one.gain or 0.0) > DEFECT_GAIN]
+    worst = min((one.severity for one in severe), key=SEVERITIES.index)
+    first = max(
+        clear or [one for one in severe if one.severity == worst],
+        key=lambda one: float("-inf") if one.gain is None else one.gain,
+    )
+    assert named[0].gain == first.gain
+    assert worst in {one.severity for one in named}
     assert (verdict.trust == "not trustworthy") >= (worst == "serious")
+
+
+def has_clear_note(findings: list[Finding]) -> bool:
+    """Whether a note explains the data better than all else."""
+    clear = [one for one in findings if (one.gain or 0.0) > DEFECT_GAIN]
+    return bool(clear) and max(clear, key=lambda one: one.gain or 0.0).severity == "note"
 
 
 @given(ESTIMATES, draw_findings())

@@ -63,7 +63,7 @@ def test_two_findings_on_one_estimate_reach_verdict_estimate_and_warnings() -> N
         assert lag.status == "dependent"
         told = "it is 0.400 ± 0.020 s if the data prefer sopdt; it is 0.57 s if u may be read held"
         assert lag.reason == told
-        text = "trustworthy but for L: the data prefer sopdt; u may be read held"
+        text = "trustworthy but for L: the data prefer sopdt, and u may be read held"
         assert verdict == Verdict("limited", text)
         warnings = list_warnings(order_findings(findings))
         assert warnings == (ORDER.sentences, READING.sentences)
@@ -118,7 +118,9 @@ def test_another_minimum_and_an_order_are_both_the_reason() -> None:
     (_, told), verdict = conclude(minimum, ORDER, estimates=(GAIN, lag))
     assert told.status == "ambiguous"
     assert told.reason == "0.31 s fits as well; it is 0.400 ± 0.020 s if the data prefer sopdt"
-    assert verdict.text.startswith("trustworthy but for L: the data prefer sopdt; another value")
+    assert verdict.text.startswith(
+        "trustworthy but for L: the data prefer sopdt, and another value"
+    )
 
 
 @pytest.mark.parametrize(
@@ -132,11 +134,28 @@ def test_the_hardest_status_counts(milder: EstimateStatus, harder: EstimateStatu
         assert lag.status == harder
 
 
-def test_findings_are_ordered_by_severity_and_then_by_gain() -> None:
+def test_clear_explanations_come_first_then_what_is_severe_and_notes_last() -> None:
     unknown = replace(ORDER, gain=None, brief="no likelihood is compared")
+    weak = replace(ORDER, gain=11.0, brief="hardly better")
+    noise = replace(note("outliers", "sensor", "far outside"), gain=500.0)
     remark = note("units", "record", "V and mV")
-    shuffled = (remark, unknown, READING, ORDER, CONSTANT)
-    assert order_findings(shuffled) == (CONSTANT, ORDER, READING, unknown, remark)
+    drift = replace(note("drift of a parameter", "constancy", "K drifts"), gain=20.0)
+    expected = (ORDER, drift, READING, CONSTANT, weak, unknown, noise, remark)
+    assert order_findings(expected[::-1]) == expected
+
+
+def test_a_serious_finding_is_named_beside_the_likeliest_explanation() -> None:
+    drift = replace(note("drift of a parameter", "constancy", "K drifts"), gain=200.0)
+    _, verdict = conclude(READING, ORDER, CONSTANT, drift)
+    assert verdict.text == (
+        "not trustworthy: the data prefer sopdt, and the model does not explain the output"
+    )
+
+
+def test_a_note_that_explains_the_data_best_is_named_beside_the_doubt() -> None:
+    drift = replace(note("drift of a parameter", "constancy", "K drifts"), gain=200.0)
+    _, verdict = conclude(ORDER, drift)
+    assert verdict.text == "trustworthy but for L: the data prefer sopdt, and drift of a parameter"
 
 
 def test_initial_states_do_not_count_as_parameters_of_the_model() -> None:
