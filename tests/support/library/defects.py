@@ -57,8 +57,24 @@ def _change_plant(share: FloatArray, change: Callable[[Process], Process]) -> De
 
 
 def _log_noise(plant: Process, seed: int) -> Record:
-    u = draw_levels(seed)
-    return make_record(u + 0.5 * draw_noise(seed + 50), _measure(plant, seed, u), reading="zero")
+    """A smooth input whose record has noise that does not act."""
+    white = np.random.default_rng([seed, 3]).standard_normal(N)
+    u = np.asarray(lfilter([0.1], [1.0, -1.6, 0.65], white))
+    y = plant.respond(np.interp(np.arange(N * FINE) / FINE, np.arange(N), u))[::FINE]
+    logged = u + 0.3 * np.std(u) * draw_noise(seed + 50)
+    return make_record(logged, y + NOISE * draw_noise(seed), reading="first")
+
+
+def _load(plant: Process, seed: int) -> Record:
+    """From 115 s on something acts beside the input."""
+    return make_record(draw_levels(seed), _measure(plant, seed, draw_levels(seed) + 0.4 * LATE))
+
+
+def _push(plant: Process, seed: int) -> Record:
+    """At 115 s the slowest state jumps."""
+    decay = np.exp(-(TIMES - TIMES[230]) / plant.times[0])
+    jump = np.where(LATE, 0.5 * np.minimum(decay, 1.0), 0.0)
+    return make_record(draw_levels(seed), _measure(plant, seed) + jump)
 
 
 def _move_before(plant: Process, seed: int) -> Record:
@@ -237,6 +253,10 @@ ACTUATOR = (
     Case("the actuator is slow", _change_input(_limit_rate), ("limit of the rate",), seed=2),
     Case("the logged input is noisy", _log_noise, ("noise of an input",), QUICK),
 )
+LOADS = (
+    Case("a load begins", _load, ("load",), seed=2),
+    Case("a state jumps", _push, ("jump of the states",)),
+)
 READING = (
     Case("the input runs in lines", _interpolate, READINGS, QUICK),
     Case("the output is a mean", _average_output, READINGS, QUICK),
@@ -258,6 +278,6 @@ STRUCTURE = (
     ),
 )
 NOISES = (
-    Case("there are outliers", _change_output(_spoil), ("outliers",)),
+    Case("there are outliers", _change_output(_spoil), ("outliers",), seed=4),
     Case("the noise grows", _grow, ("unequal variance",)),
 )
