@@ -13,6 +13,8 @@ from sysid.results.findings import Finding, Severity
 from sysid.results.verdict import Verdict
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
 
+_MOST_REASONS = 2  # of an estimate, and in a verdict
+
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
 _OF_NOISE = ("outliers", "unequal variance", "coloured noise")
 _RANKS: tuple[EstimateStatus, ...] = (
@@ -51,16 +53,26 @@ def conclude_estimates(
 
 
 def _conclude_estimate(estimate: Estimate, findings: Sequence[Finding]) -> Estimate:
-    if estimate.status not in _RANKS:
+    against = [one for one in findings if _is_against(one, estimate)]
+    if not against or estimate.status not in _RANKS:
         return estimate
-    against = [one for one in findings if estimate.name in one.parameters and one.status in _RANKS]
-    if not against:
-        return estimate
-    status = max((one.status for one in against), key=_RANKS.index)
-    if _RANKS.index(status) <= _RANKS.index(estimate.status):
-        return estimate
-    first = next(one for one in against if one.status == status)
-    return replace(estimate, status=status, reason=_explain(estimate, first))
+    statuses = (estimate.status, *(one.status for one in against))
+    known = "" if estimate.status == "identified" else estimate.reason
+    found = [_explain(estimate, one) for one in against if one.status != estimate.status]
+    reasons = dict.fromkeys(reason for reason in (known, *found) if reason)
+    return replace(
+        estimate,
+        status=max(statuses, key=_RANKS.index),
+        reason="; ".join(list(reasons)[:_MOST_REASONS]),
+    )
+
+
+def _is_against(finding: Finding, estimate: Estimate) -> bool:
+    """Whether a finding makes an estimate doubtful; a serious one without names does all."""
+    if finding.severity == "note" or finding.status not in _RANKS:
+        return False
+    is_for_all = finding.severity == "serious" and not finding.parameters
+    return estimate.name in finding.parameters or (is_for_all and estimate.is_free)
 
 
 def _explain(estimate: Estimate, finding: Finding) -> str:
@@ -79,7 +91,7 @@ def conclude_verdict(
     """Conclude the verdict from findings in their order, and from the statuses that they gave.
 
     A result is not trustworthy if a finding says so, or if findings leave none of the parameters
-    that the model declares identified.
+    that the model declares identified. The text names the first two causes of doubt.
 
     Examples
     --------
@@ -95,10 +107,7 @@ def conclude_verdict(
     severe = [one for one in findings if one.severity != "note"]
     if not severe:
         return Verdict("trustworthy", "trustworthy")
-    first = findings[0]
-    cause = severe[0].brief
-    if first.severity == "note":  # it explains the data, and something else the doubt
-        cause = f"{cause}, and {first.brief}"
+    cause = ", and ".join(_list_causes(findings[0], severe))
     is_serious = any(one.severity == "serious" for one in severe)
     names = set(declared)
     free = [one for one in estimates if one.is_free and one.name in names]
@@ -108,6 +117,18 @@ def conclude_verdict(
         return Verdict("not trustworthy", text)
     but = f" but for {join_names(doubtful)}:" if doubtful else ", but"
     return Verdict("limited", f"trustworthy{but} {cause}")
+
+
+def _list_causes(first: Finding, severe: Sequence[Finding]) -> list[str]:
+    """List the briefs that a verdict names: the likeliest cause of doubt, and one more.
+
+    That is the most severe one, then a note that explains the data better, then the next.
+    """
+    worst = min(severe, key=lambda one: _SEVERITIES.index(one.severity))
+    notes = [first] if first.severity == "note" else []
+    return list(dict.fromkeys(one.brief for one in (severe[0], worst, *notes, *severe)))[
+        :_MOST_REASONS
+    ]
 
 
 def list_warnings(findings: Sequence[Finding]) -> tuple[str, ...]:
