@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from sysid.core.memo import cache_by_identity
 from sysid.language.delays import collect_past_values, has_varying_delay, mentions_time
+from sysid.language.time_switches import list_sides
 from sysid.language.tree import Expression, PastValue
 from sysid.models.model import Model
 
@@ -34,6 +35,12 @@ def list_stages(model: Model) -> tuple[int, ...]:
     if is_difference(model):
         return (2,)
     return (0, 1, 2) if model.solver.method == "rk4" else (0,)
+
+
+@cache_by_identity
+def list_switch_sides(model: Model) -> tuple[Expression, ...]:
+    """List the sides of the switches in time at which an integration step is divided."""
+    return () if is_difference(model) else list_sides(model.equations)
 
 
 def find_state_position(model: Model, stage: int, equation: int, state: int) -> int:
@@ -91,10 +98,14 @@ def _has_unknown_delay(past: PastValue) -> bool:
 
 
 def reads_cubics(model: Model) -> bool:
-    """Whether delayed states are read on the cubics of Runge-Kutta steps, with their slopes."""
+    """Whether delayed states are read on the cubics of Runge-Kutta steps, with their slopes.
+
+    A step that is divided at switches in time is no such cubic.
+    """
     solver = model.solver
     is_runge_kutta = model.form == "differential" and solver.method == "rk4"
-    return is_runge_kutta and solver.interpolation == "cubic"
+    is_whole = not list_switch_sides(model)
+    return is_runge_kutta and solver.interpolation == "cubic" and is_whole
 
 
 class StoredHistory(NamedTuple):
