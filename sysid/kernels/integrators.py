@@ -262,9 +262,7 @@ class _Integration:
         merged = lanes.branch(lanes.test_any(is_divided), emit_parts, undivided)
         return dict(zip(names, merged, strict=True))
 
-    def _emit_parts(
-        self, sides: tuple[Expression, ...], last: list[IrValue]
-    ) -> dict[str, IrValue]:
+    def _emit_parts(self, sides: tuple[Expression, ...], last: list[IrValue]) -> dict[str, IrValue]:
         """Emit the parts of a step, one after the other: at most one switch of each kind."""
         lanes, b, names = self.lanes, self.lanes.builder, self.states.names
         end = lanes.splat(lanes.make_number(1.0))

@@ -7,11 +7,11 @@ before a switch, and the next begins just behind it.
 A switch is told by its *side*, an expression that is a whole number and changes at the switch only.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Mapping
 from itertools import combinations
 
 from sysid.language.delays import collect_past_values, mentions_time
-from sysid.language.table_functions import TABLE_FUNCTIONS, split_table
+from sysid.language.table_functions import split_table
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, walk
 
 _ORDERINGS = ("<", "<=", ">", ">=")
@@ -24,7 +24,7 @@ def list_sides(trees: Iterable[Expression]) -> tuple[Expression, ...]:
     A switch that a signal has a part in, such as ``max(x, t)``, is none in time. Equality holds at
     single times, and has no sides.
     """
-    found = [side for tree in trees for node in walk(tree) for side in _iterate_sides(node)]
+    found = [side for tree in trees for node in walk(tree) for side in _list_node_sides(node)]
     return tuple(side for side in dict.fromkeys(found) if _depends_on_time_alone(side))
 
 
@@ -32,34 +32,55 @@ def _depends_on_time_alone(tree: Expression) -> bool:
     return mentions_time(tree) and not collect_past_values(tree)
 
 
-def _iterate_sides(node: Expression) -> Iterator[Expression]:
-    """Iterate over the sides of a node, also of one that depends on signals."""
+def _list_node_sides(node: Expression) -> list[Expression]:
+    """List the sides of a node, also of one that depends on signals."""
     match node:
         case Binary(operator, left, right) if operator in _ORDERINGS:
-            yield _tell(operator, left, right)
-        case FunctionCall("sign", (argument,)):
-            yield _tell(">", argument, _ZERO)
-            yield _tell("<", argument, _ZERO)
-        case FunctionCall("abs", (argument,)):
-            yield _tell(">", argument, _ZERO)
-        case FunctionCall("min" | "max", arguments):
-            for first, second in combinations(arguments, 2):
-                yield _tell(">", first, second)
-        case FunctionCall("clip", (argument, lower, upper)):
-            yield _tell(">", argument, lower)
-            yield _tell(">", argument, upper)
-        case FunctionCall("floor"):
-            yield node
-        case FunctionCall("mod", (argument, divisor)):
-            # Rounded, so that it changes exactly where the remainder does.
-            periods = Binary("/", Binary("-", argument, node), divisor)
-            yield FunctionCall("floor", (Binary("+", periods, _HALF),))
-        case FunctionCall(function) if function in TABLE_FUNCTIONS:
-            table = split_table(node)
-            for position in table.x:
-                yield _tell(">", table.argument, Number(position))
+            return [_tell(operator, left, right)]
+        case FunctionCall(function) if function in _SIDES:
+            return _SIDES[function](node)
+        case _:
+            return []
 
 
 def _tell(operator: str, left: Expression, right: Expression) -> Expression:
     """Tell by 1 or 0 whether a comparison holds."""
     return FunctionCall("where", (Binary(operator, left, right), _ONE, _ZERO))
+
+
+def _list_signs(call: FunctionCall) -> list[Expression]:
+    return [_tell(operator, call.arguments[0], _ZERO) for operator in (">", "<")]
+
+
+def _list_larger(call: FunctionCall) -> list[Expression]:
+    return [_tell(">", first, second) for first, second in combinations(call.arguments, 2)]
+
+
+def _list_limits(call: FunctionCall) -> list[Expression]:
+    argument, *limits = call.arguments
+    return [_tell(">", argument, limit) for limit in limits]
+
+
+def _list_points(call: FunctionCall) -> list[Expression]:
+    table = split_table(call)
+    return [_tell(">", table.argument, Number(position)) for position in table.x]
+
+
+def _list_periods(call: FunctionCall) -> list[Expression]:
+    """List the number of the period, rounded, so that it changes exactly where the rest does."""
+    argument, period = call.arguments
+    periods = Binary("/", Binary("-", argument, call), period)
+    return [FunctionCall("floor", (Binary("+", periods, _HALF),))]
+
+
+_SIDES: Mapping[str, Callable[[FunctionCall], list[Expression]]] = {
+    "sign": _list_signs,
+    "abs": _list_signs,
+    "min": _list_larger,
+    "max": _list_larger,
+    "clip": _list_limits,
+    "table": _list_points,
+    "pchip": _list_points,
+    "floor": lambda call: [call],
+    "mod": _list_periods,
+}
