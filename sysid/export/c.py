@@ -376,7 +376,8 @@ def _write_stages(
             _wrap_statement(f"slope[stage][{i}] = ", equation(program, "slope", i))
         )
     if first_rises := program.assign_rises("first", "slope[0]"):
-        lines += ["    if (stage == 0) {", *indent_lines(first_rises, 2), "    }"]
+        when = "stage == 0 && number == 0" if program.sides else "stage == 0"
+        lines += [f"    if ({when}) {{", *indent_lines(first_rises, 2), "    }"]
     return [*lines, "}", *program.assign_rises("last", "slope[3]")]
 
 

@@ -309,9 +309,11 @@ def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
         parts = [
             *program.language.open_parts(program.stem, len(program.sides)),
             "    slope_1 = rates(step, begin, *now)",
+            *_write_first_rises(program),
             "    slope_2 = rates(step, 0.5*(begin + end), *(now + duration/2*slope_1))",
             "    slope_3 = rates(step, 0.5*(begin + end), *(now + duration/2*slope_2))",
             "    slope_4 = rates(step, end, *(now + duration*slope_3))",
+            *indent_lines(program.assign_rises("last", "slope_4")),
             "    now = now + duration/6*(slope_1 + 2*slope_2 + 2*slope_3 + slope_4)",
             *program.language.close_parts(),
             f"{target} = now",
@@ -331,6 +333,12 @@ def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
             )
         ),
     ]
+
+
+def _write_first_rises(program: GeneratedProgram) -> list[str]:
+    """Write the rises by the first slope of a step, in its first part."""
+    rises = program.assign_rises("first", "slope_1")
+    return ["    if number == 0:", *indent_lines(rises, 2)] if rises else []
 
 
 def _write_switches(program: GeneratedProgram) -> list[str]:

@@ -230,11 +230,12 @@ class _Integration:
             return {n: lanes.add(x, lanes.mul(width, slope[n])) for n, x in part.start.items()}
 
         first = emit_slopes(0, dict(part.start))
-        states.first_rises = {n: lanes.mul(width, first[n]) for n in states.with_rises}
+        if part.places is None:
+            states.first_rises = {n: lanes.mul(width, first[n]) for n in states.with_rises}
         second = emit_slopes(1, shift_states(half, first))
         third = emit_slopes(1, shift_states(half, second))
         fourth = emit_slopes(2, shift_states(width, third))
-        states.last_rises = {n: lanes.mul(width, fourth[n]) for n in states.with_rises}
+        states.last_rises = {n: lanes.mul(self.step, fourth[n]) for n in states.with_rises}
         two = lanes.make_number(2.0)
         mean = {
             n: lanes.add(
@@ -249,27 +250,34 @@ class _Integration:
         self, sides: tuple[Expression, ...], whole: dict[str, IrValue]
     ) -> dict[str, IrValue]:
         """Emit the step in parts for lanes that switch in it; `whole` stays in other lanes."""
-        lanes, names = self.lanes, self.states.names
+        lanes, states = self.lanes, self.states
         begin, end = (lanes.splat(lanes.make_number(place)) for place in (0.0, 1.0))
         last = self._emit_sides(sides, end)
         is_divided = self._differ(self._emit_sides(sides, begin), last)
+        undivided = [lanes.splat(value) for value in (*whole.values(), *states.last_rises.values())]
 
         def emit_parts() -> list[IrValue]:
-            divided = self._emit_parts(sides, last)
-            return [lanes.select(is_divided, divided[name], whole[name]) for name in names]
+            pairs = zip(self._emit_parts(sides, last, undivided), undivided, strict=True)
+            return [lanes.select(is_divided, divided, value) for divided, value in pairs]
 
-        undivided = [lanes.splat(whole[name]) for name in names]
         merged = lanes.branch(lanes.test_any(is_divided), emit_parts, undivided)
-        return dict(zip(names, merged, strict=True))
+        states.last_rises = dict(zip(states.with_rises, merged[len(whole) :], strict=True))
+        return dict(zip(whole, merged, strict=False))
 
-    def _emit_parts(self, sides: tuple[Expression, ...], last: list[IrValue]) -> dict[str, IrValue]:
-        """Emit the parts of a step, one after the other: at most one switch of each kind."""
-        lanes, b, names = self.lanes, self.lanes.builder, self.states.names
+    def _emit_parts(
+        self, sides: tuple[Expression, ...], last: list[IrValue], whole: list[IrValue]
+    ) -> list[IrValue]:
+        """Emit the parts of a step, one after the other: at most as many switches as sides.
+
+        They give the states, and their rises by the last slope, as `whole` does of the whole step.
+        """
+        lanes, b, states = self.lanes, self.lanes.builder, self.states
         end = lanes.splat(lanes.make_number(1.0))
         loop = KernelLoop(lanes)
         number = loop.carry(lanes.make_integer(0))
         begin = loop.carry(lanes.splat(lanes.make_number(0.0)))
-        now = {name: loop.carry(self.states.now[name]) for name in names}
+        starts = [*states.now.values(), *whole[len(states.names) :]]
+        carried = [loop.carry(value) for value in starts]
         before = self._emit_sides(sides, begin)
         may_divide = b.icmp_signed("<", number, lanes.make_integer(len(sides)))
         switches = b.and_(self._differ(before, last), lanes.splat(may_divide))
@@ -279,14 +287,17 @@ class _Integration:
         stop = lanes.select(switches, low, end)
         places = {0: begin, 1: lanes.mul(lanes.make_number(0.5), lanes.add(begin, stop)), 2: stop}
         width = lanes.mul(lanes.sub(stop, begin), self.step)
-        moved = self.emit_part(StepPart(width, now, places))
+        now = dict(zip(states.names, carried, strict=False))
+        moved = [*self.emit_part(StepPart(width, now, places)).values()]
+        moved += states.last_rises.values()
         is_finished = lanes.compare(">=", begin, end)
-        following = {n: lanes.select(is_finished, now[n], moved[n]) for n in names}
+        following = [
+            lanes.select(is_finished, old, new) for old, new in zip(carried, moved, strict=True)
+        ]
         resumed = lanes.select(switches, high, end)
-        is_open = lanes.test_any(lanes.compare("<", resumed, end))
-        loop.leave_if(b.not_(is_open))
-        for name in names:
-            loop.update(now[name], following[name])
+        loop.leave_if(b.not_(lanes.test_any(lanes.compare("<", resumed, end))))
+        for value, new in zip(carried, following, strict=True):
+            loop.update(value, new)
         loop.update(begin, resumed)
         loop.update(number, b.add(number, lanes.make_integer(1)))
         loop.repeat()

@@ -98,14 +98,10 @@ def _has_unknown_delay(past: PastValue) -> bool:
 
 
 def reads_cubics(model: Model) -> bool:
-    """Whether delayed states are read on the cubics of Runge-Kutta steps, with their slopes.
-
-    A step that is divided at switches in time is no such cubic.
-    """
+    """Whether delayed states are read on the cubics of Runge-Kutta steps, with their slopes."""
     solver = model.solver
     is_runge_kutta = model.form == "differential" and solver.method == "rk4"
-    is_whole = not list_switch_sides(model)
-    return is_runge_kutta and solver.interpolation == "cubic" and is_whole
+    return is_runge_kutta and solver.interpolation == "cubic"
 
 
 class StoredHistory(NamedTuple):
@@ -115,7 +111,7 @@ class StoredHistory(NamedTuple):
     ----------
     state : str
     delay : Expression or None
-        None: the samples.
+        None: the samples; with three columns, also the rises of the steps that end there.
     columns : int
         Values in a row for each individual.
     """
@@ -130,6 +126,8 @@ def list_stored_histories(model: Model) -> list[StoredHistory]:
     if not reads_cubics(model):
         return [StoredHistory(name, None, 1) for name in _list_states_with_history(model)]
     positions = group_delayed_reads(model, "state")
+    if list_switch_sides(model):  # a divided step reads at any place
+        return [StoredHistory(name, None, 3) for name in _list_states_with_history(model)]
     return [StoredHistory(*past, 2 if max(positions[past]) > 0 else 1) for past in positions]
 
 

@@ -3,7 +3,7 @@
 from sysid.kernels.expression_code import Environment
 from sysid.kernels.signals import past_reads
 from sysid.kernels.signals.block_signals import Delays, ExperimentHead, States
-from sysid.kernels.signals.cubic_reads import CubicReader
+from sysid.kernels.signals.cubic_reads import CubicReader, StepCubicReader
 from sysid.kernels.signals.delayed_reads import (
     DelayedReader,
     DirectReader,
@@ -30,16 +30,16 @@ class SignalReaders:
         one_step: bool,
     ) -> None:
         self._lanes, self._model, self._experiment = lanes, model, experiment
-        self._delays = delays
+        self._delays, self._states = delays, states
         self._inputs = {signal.name: i for i, signal in enumerate(model.inputs)}
         self._readers: dict[tuple[str, Expression, int], DelayedReader] = {}
         self._owners: list[tuple[str, DelayedReader]] = []
-        self._part_readers: dict[tuple[str, Expression], DirectReader] = {}
+        self._part_readers: dict[tuple[str, Expression], DirectReader | StepCubicReader] = {}
         cubic = model.solver.interpolation == "cubic"
         for past, positions in past_reads.group_delayed_reads(model, "state").items():
             delay = lanes.clamp(delays.to_steps(past[1]), experiment.get_number("cap"))
             if past_reads.reads_cubics(model):
-                self._add_reader(past, positions, CubicReader(lanes, states, past, delay))
+                self._add_cubic_reader(past, positions, delay)
                 continue
             history = states.get_history(past[0])
             if past_reads.list_switch_sides(model):
@@ -62,6 +62,17 @@ class SignalReaders:
                     {*chain},
                     self._build_input_reader(past[0], delays.to_steps(past[1]), chain),
                 )
+
+    def _add_cubic_reader(
+        self, past: tuple[str, Expression], positions: set[int], delay: IrValue
+    ) -> None:
+        if not past_reads.list_switch_sides(self._model):
+            reader = CubicReader(self._lanes, self._states, past, delay)
+            self._add_reader(past, positions, reader)
+            return
+        anywhere = StepCubicReader(self._lanes, self._states, past, delay)
+        self._part_readers[past] = anywhere
+        self._add_reader(past, positions, anywhere)
 
     def _add_reader(
         self, past: tuple[str, Expression], positions: set[int], reader: DelayedReader
