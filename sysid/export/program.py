@@ -344,7 +344,7 @@ class LoopScope(ExportScope):
     def _write_state_part(self, name: str) -> str:
         """Write the place in the present step at which a state is read; empty: its start."""
         if self.stage == "update" and self._is_updated(name):
-            return "end" if self._part else "1"
+            return "end" if self._part else "1.0"
         return self._part
 
     def _write_delayed_state(self, past: PastValue) -> str:
@@ -353,7 +353,6 @@ class LoopScope(ExportScope):
         delay = self._write_state_delay(past)
         if place := self._write_state_part(past.name):
             there = self._write_present_state(past.name)
-            place = "1.0" if place == "1" else place
             return program.write_helper_call("lately", *every, before, "step", place, there, delay)
         return program.write_helper_call("past", *every, before, program.loop_variable, delay)
 

@@ -143,9 +143,9 @@ def test_a_step_divided_at_switches_in_time_equals_its_twin(
     model = differential(
         SWITCHING, "x(t-L) + v", solver=solver, history=history, initial={"x": 0.3}
     )
-    assert_equal(Problem.build(model, [record(24, hold=hold)]))
+    assert_equal(Problem.build(model, [record(16, hold=hold)]))
     if interpolation == "linear":
-        assert_equal(Problem.build(model, [record(24)], prediction="one-step"), one_step=True)
+        assert_equal(Problem.build(model, [record(16)], prediction="one-step"), one_step=True)
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])

@@ -58,6 +58,21 @@ _FUNCTIONS = {
     "table": lambda at, *points: np.interp(at, *np.reshape(points, (2, -1))),
     "pchip": lambda at, *points: interpolate_pchip(at, *np.reshape(points, (2, -1))),
 }
+_SIDES = {
+    "sign": lambda x: (_tell(x, 0), _tell(0, x)),
+    "abs": lambda x: (_tell(x, 0), _tell(0, x)),
+    "floor": lambda x: (np.floor(x),),
+    "min": lambda *x: tuple(_tell(a, b) for a, b in combinations(x, 2)),
+    "max": lambda *x: tuple(_tell(a, b) for a, b in combinations(x, 2)),
+    "clip": lambda x, *limits: tuple(_tell(x, limit) for limit in limits),
+    "table": lambda x, *points: tuple(_tell(x, at) for at in points[: len(points) // 2]),
+    "pchip": lambda x, *points: tuple(_tell(x, at) for at in points[: len(points) // 2]),
+}
+"""On which sides of their switches the functions that jump or bend are, at their arguments."""
+
+
+def _tell(a: float, b: float) -> float:
+    return np.nan if np.isnan(a + b) else float(a > b)
 
 
 _OPERATORS = {
@@ -231,34 +246,23 @@ class ModelTwin:
     def _tell_sides(self, m: int, c: float) -> list[float]:
         """On which side of each of its switches in time the equations are."""
         told: list[float] = []
-
-        def tell(*nodes: Expression) -> tuple[float, ...] | None:
-            parts = [part for node in nodes for part in walk(node)]
-            timely = any(isinstance(p, Symbol) and p.kind == "time" for p in parts)
-            if not timely or any(isinstance(p, PastValue) for p in parts):
-                return None
-            return tuple(float(self._value(node, m, c, {}, 0)) for node in nodes)
-
         for node in dict.fromkeys(n for e in self.model.equations for n in walk(e)):
+            arguments = node.arguments if isinstance(node, FunctionCall) else ()
+            ends = [self._value_in_time(argument, m, c) for argument in arguments]
             match node:
-                case Binary("<" | "<=" | ">" | ">=", left, right) if tell(left, right):
-                    told.append(self._value(node, m, c, {}, 0))
-                case FunctionCall("sign" | "abs", (inner,)) if ends := tell(inner):
-                    told += [ends[0] > 0, ends[0] < 0]
-                case FunctionCall("floor", (inner,)) if ends := tell(inner):
-                    told.append(floor(ends[0]))
-                case FunctionCall("mod", (inner, period)) if ends := tell(inner, period):
-                    told.append(round((ends[0] - np.mod(*ends)) / ends[1]))
-                case FunctionCall("min" | "max", arguments):
-                    pairs = [tell(*pair) for pair in combinations(arguments, 2)]
-                    told += [ends[0] > ends[1] for ends in pairs if ends]
-                case FunctionCall("clip", (inner, *limits)):
-                    pairs = [tell(inner, limit) for limit in limits]
-                    told += [ends[0] > ends[1] for ends in pairs if ends]
-                case FunctionCall("table" | "pchip", (inner, *points)) if ends := tell(inner):
-                    xs = [self._value(x, 0, 0.0, {}, 0) for x in points[: len(points) // 2]]
-                    told += [ends[0] > x for x in xs]
-        return told
+                case Binary("<" | "<=" | ">" | ">="):
+                    told.append(self._value_in_time(node, m, c))
+                case FunctionCall("mod"):
+                    told.append(np.round((ends[0] - np.mod(*ends)) / ends[1]))
+                case FunctionCall(function) if function in _SIDES:
+                    told += _SIDES[function](*ends)
+        return [float(side) for side in told if not np.isnan(side)]
+
+    def _value_in_time(self, e: Expression, m: int, c: float) -> float:
+        """An expression without signals; nan of any other."""
+        if any(isinstance(part, PastValue) for part in walk(e)):
+            return math.nan
+        return float(self._value(e, m, c, {}, 0))
 
     def _slopes(self, m: int, c: float, values: dict[str, float]) -> dict[str, float]:
         return {
