@@ -8,7 +8,6 @@ A switch is told by its *side*, an expression that is a whole number and changes
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from itertools import combinations
 
 from sysid.language.delays import collect_past_values, mentions_time
 from sysid.language.table_functions import split_table
@@ -53,7 +52,7 @@ def _list_signs(call: FunctionCall) -> list[Expression]:
 
 
 def _list_larger(call: FunctionCall) -> list[Expression]:
-    return [_tell(">", first, second) for first, second in combinations(call.arguments, 2)]
+    return [_tell(">", *call.arguments)]  # of two: of more, the checker makes pairs
 
 
 def _list_limits(call: FunctionCall) -> list[Expression]:
