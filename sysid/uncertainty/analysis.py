@@ -336,8 +336,8 @@ def _correct_for_jumps(
 
 
 def _remove_stderr(estimate: Estimate) -> Estimate:
-    """Remove the standard error if the output changes far off on one side of the estimate only."""
-    reason = "the output does not change with it near here, and farther away on one side only"
+    """Remove the standard error if the output jumps on one side of the estimate only."""
+    reason = "the output changes with it in jumps, and here on one side only"
     return replace(estimate, stderr=None, interval95=None, reason=reason)
 
 

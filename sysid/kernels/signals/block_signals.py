@@ -229,43 +229,44 @@ class States:
             loop = KernelLoop(lanes)
             row = loop.carry(lanes.make_integer(0))
             for (name, _), history in self._histories.items():
-                index = b.mul(row, lanes.make_integer(history.columns * lanes.width))
                 if history.columns == _WITH_RISES:
+                    index = b.mul(row, lanes.make_integer(lanes.width))
                     rises = self.first_rises[name], self.last_rises[name]
-                    self._store_step(history, index, (self._before[name], *rises))
+                    self._store_row(history, index, (self._before[name], *rises))
                     continue
+                index = b.mul(row, lanes.make_integer(history.columns * lanes.width))
                 values = [self._before[name]] * history.columns
                 lanes.store_columns(values, history.base, index)
             following = b.add(row, lanes.make_integer(1))
             loop.update(row, following)
             loop.leave_if(b.icmp_signed(">=", following, self._reach))
             loop.repeat()
-            self._store_finished_steps(self._reach)
+            self._store_finished_step(self._reach)
         return self._reach
 
     def store_states(self, row: IrValue) -> None:
         """Store the present states in a row of their samples."""
+        index = self._lanes.builder.mul(row, self._lanes.make_integer(self._lanes.width))
         for (name, delay), history in self._histories.items():
             if delay is None:
-                self._store_step(history, self._find_row(history, row), (self.now[name],))
+                self._store_row(history, index, (self.now[name],))
 
-    def _store_finished_steps(self, row: IrValue) -> None:
-        """Store the present states, and the rises of the steps that end there."""
+    def _store_finished_step(self, row: IrValue) -> None:
+        """Store the present states, and the rises of the step that ends there."""
         self.store_states(row)
         for (name, _), history in self._histories.items():
             if history.columns == _WITH_RISES:
-                step = self.now[name], self.first_rises[name], self.last_rises[name]
-                self._store_step(history, self._find_row(history, row), step)
+                index = self._lanes.builder.mul(row, self._lanes.make_integer(self._lanes.width))
+                values = self.now[name], self.first_rises[name], self.last_rises[name]
+                self._store_row(history, index, values)
 
-    def _find_row(self, history: StateHistory, row: IrValue) -> IrValue:
-        size = self._lanes.make_integer(history.columns * self._lanes.width)
-        return self._lanes.builder.mul(row, size)
-
-    def _store_step(
+    def _store_row(
         self, history: StateHistory, index: IrValue, values: tuple[IrValue, ...]
     ) -> None:
-        """Store values in a row of a history, column by column."""
+        """Store the first columns of a row, whose index counts rows of one column."""
         b, lanes = self._lanes.builder, self._lanes
+        if history.columns > 1:
+            index = b.mul(index, lanes.make_integer(history.columns))
         for column, value in enumerate(values):
             place = b.add(index, lanes.make_integer(column * lanes.width)) if column else index
             lanes.store_row(value, history.base, place)
@@ -311,7 +312,7 @@ class States:
         following = b.add(row, lanes.make_integer(1))
         if not self._histories:
             return following
-        self._store_finished_steps(following)
+        self._store_finished_step(following)
 
         def emit_slide() -> list[IrValue]:
             first = b.sub(following, self._reach)

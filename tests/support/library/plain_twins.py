@@ -253,7 +253,7 @@ class ModelTwin:
                 case Binary("<" | "<=" | ">" | ">="):
                     told.append(self._value_in_time(node, m, c))
                 case FunctionCall("mod"):
-                    told.append(np.round((ends[0] - np.mod(*ends)) / ends[1]))
+                    told.append(np.round((ends[0] - np.mod(ends[0], ends[1])) / ends[1]))
                 case FunctionCall(function) if function in _SIDES:
                     told += _SIDES[function](*ends)
         return [float(side) for side in told if not np.isnan(side)]
