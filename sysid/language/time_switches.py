@@ -10,7 +10,6 @@ A switch is told by its *side*, an expression that is a whole number and changes
 from collections.abc import Callable, Iterable, Mapping
 
 from sysid.language.delays import collect_past_values, mentions_time
-from sysid.language.table_functions import split_table
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, walk
 
 _ORDERINGS = ("<", "<=", ">", ">=")
@@ -21,7 +20,8 @@ def list_sides(trees: Iterable[Expression]) -> tuple[Expression, ...]:
     """List the sides of all switches in time of some expressions, each once.
 
     A switch that a signal has a part in, such as ``max(x, t)``, is none in time. Equality holds at
-    single times, and has no sides.
+    single times, and has no sides. Nor has a table: it bends at each of its points, and to locate
+    all of them would take longer than the steps that its bends need.
     """
     found = [side for tree in trees for node in walk(tree) for side in _list_node_sides(node)]
     return tuple(side for side in dict.fromkeys(found) if _depends_on_time_alone(side))
@@ -60,11 +60,6 @@ def _list_limits(call: FunctionCall) -> list[Expression]:
     return [_tell(">", argument, limit) for limit in limits]
 
 
-def _list_points(call: FunctionCall) -> list[Expression]:
-    table = split_table(call)
-    return [_tell(">", table.argument, Number(position)) for position in table.x]
-
-
 def _list_periods(call: FunctionCall) -> list[Expression]:
     """List the number of the period, rounded, so that it changes exactly where the rest does."""
     argument, period = call.arguments
@@ -78,8 +73,6 @@ _SIDES: Mapping[str, Callable[[FunctionCall], list[Expression]]] = {
     "min": _list_larger,
     "max": _list_larger,
     "clip": _list_limits,
-    "table": _list_points,
-    "pchip": _list_points,
     "floor": lambda call: [call],
     "mod": _list_periods,
 }

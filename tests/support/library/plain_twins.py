@@ -65,8 +65,6 @@ _SIDES = {
     "min": lambda *x: tuple(_tell(a, b) for a, b in combinations(x, 2)),
     "max": lambda *x: tuple(_tell(a, b) for a, b in combinations(x, 2)),
     "clip": lambda x, *limits: tuple(_tell(x, limit) for limit in limits),
-    "table": lambda x, *points: tuple(_tell(x, at) for at in points[: len(points) // 2]),
-    "pchip": lambda x, *points: tuple(_tell(x, at) for at in points[: len(points) // 2]),
 }
 """On which sides of their switches the functions that jump or bend are, at their arguments."""
 
