@@ -133,8 +133,7 @@ def test_sensitivities_are_those_of_the_closed_form(name: str) -> None:
     problem, theta = pose(case), np.array(case.values)
     found = compute_sensitivities(problem, theta)
     point = to_unit(problem.evaluator, theta[None])[0]
-    for d in range(theta.size):
-        step = 1e-6 * np.eye(theta.size)[d]
+    for d, step in enumerate(1e-6 * np.eye(theta.size)):
         ends = from_unit(problem.evaluator, np.array([point - step, point + step]))
         low, high = (case.closed(TIMES, *end) for end in ends)
         slope = (high - low) / 2e-6
@@ -164,8 +163,8 @@ def test_the_output_has_one_slope_in_the_time_of_a_switch(name: str, method: str
 def test_an_individual_does_not_depend_on_its_neighbours() -> None:
     problem = pose(CASES["pulses"])
     random = np.random.default_rng(3)
-    ends = np.array([*BOUNDS.values()]).T
-    theta = random.uniform(*ends, (37, 4))
+    lower, upper = np.array([*CASES["pulses"].parameters.values()]).T
+    theta = random.uniform(lower, upper, (37, 4))
     together = problem.predict(theta)
     order = random.permutation(37)
     np.testing.assert_array_equal(problem.predict(theta[order]), together[order])
