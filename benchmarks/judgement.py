@@ -39,6 +39,7 @@ from sysid.core.errors import SysidError
 from sysid.identification.identify import identify_records
 from sysid.identification.identify_arguments import read_records
 from sysid.models.catalogue.load import resolve_model
+from sysid.results.findings import Finding
 
 SEEDS, QUICK = 10, 1
 FIRST_SEED = 71_000
@@ -168,7 +169,7 @@ def judge_case(task: tuple[str, int]) -> Answer:
 
 def _tell_answer(case: Case) -> dict[str, Any]:
     found = identify_as_command(case.model, case.recording)
-    findings = getattr(found, "findings", ())
+    findings = found.findings
     first = findings[0] if findings else None
     estimates = compare_truth(found, case.truth)
     settings = read_advice(found)
@@ -183,30 +184,23 @@ def _tell_answer(case: Case) -> dict[str, Any]:
     }
 
 
-def _describe_finding(finding: Any) -> dict[str, Any]:
+def _describe_finding(finding: Finding) -> dict[str, Any]:
     moves = {move.parameter: [float(move.value), float(move.stderrs)] for move in finding.moves}
     return {
         "explanation": finding.explanation,
         "family": finding.family,
-        "gain": float(finding.gain),
+        "gain": finding.gain,
         "moves": moves,
         "severity": finding.severity,
         "brief": finding.brief,
         "text": finding.text,
-        "advice": str(finding.advice or ""),
+        "advice": finding.advice,
     }
 
 
 def read_advice(found: Identification) -> tuple[str, ...]:
     """Read the verdict's first advice as settings; `model=NAME` is another model."""
-    findings = getattr(found, "findings", ())
-    if findings:
-        return read_settings(str(findings[0].advice or ""))
-    orders = found.order_comparison
-    advises = any("Use that model" in reason.text for reason in found.verdict.reasons[:1])
-    if advises and orders is not None and orders.preferred_model is not None:
-        return (f"model={orders.preferred_model}",)
-    return ()
+    return read_settings(found.findings[0].advice) if found.findings else ()
 
 
 def read_settings(text: str) -> tuple[str, ...]:
@@ -256,7 +250,7 @@ def tell_each(answer: Answer) -> str:
         for name, one in answer.estimates.items()
     )
     findings = "; ".join(
-        f"{one['family']}/{one['explanation']} gain {one['gain']:.0f}, moves "
+        f"{one['family']}/{one['explanation']} gain {one['gain'] or 0.0:.0f}, moves "
         + ", ".join(f"{name} {move[1]:+.1f}" for name, move in one["moves"].items())
         for one in answer.findings
     )
@@ -500,7 +494,8 @@ def _compare_pair(title: str, first: Identification, second: Identification) -> 
         errors = abs(one.value - other.value) / float(np.hypot(one.stderr, other.stderr))
         print(
             f"| {title} | {one.name} | {one.value:.4g} ± {one.stderr:.2g} {one.status} "
-            f"| {other.value:.4g} ± {other.stderr:.2g} {other.status} | {errors:.1f} | {verdicts} |",
+            f"| {other.value:.4g} ± {other.stderr:.2g} {other.status} | {errors:.1f} "
+            f"| {verdicts} |",
             flush=True,
         )
         verdicts = ""

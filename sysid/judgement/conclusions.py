@@ -6,12 +6,16 @@ never make a verdict milder, nor a status.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.judgement.levels import NOTABLE_MOVE
-from sysid.results.findings import Finding, Severity
+from sysid.results.findings import Finding, Severity, note
 from sysid.results.verdict import Verdict
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
+
+if TYPE_CHECKING:
+    from sysid.results.identification import Identification
 
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
 _RANKS: tuple[EstimateStatus, ...] = (
@@ -102,6 +106,12 @@ def conclude_verdict(
         return Verdict("not trustworthy", text)
     but = f" but for {join_names(doubtful)}:" if doubtful else ", but"
     return Verdict("limited", f"trustworthy{but} {first.brief}")
+
+
+def add_reading_notes(found: "Identification", texts: Sequence[str]) -> "Identification":
+    """Add to a result what was noted when its recording was read."""
+    notes = [note("recording", "record", text) for text in texts]
+    return replace(found, findings=(*found.findings, *notes), warnings=(*texts, *found.warnings))
 
 
 def list_warnings(findings: Sequence[Finding]) -> tuple[str, ...]:
