@@ -71,7 +71,7 @@ def tabulate_explanations(result: Result) -> ExplanationTable | None:
     return ExplanationTable(
         [append_unit(one.name, one.unit) for one in estimates],
         [
-            ExplanationRow("nothing is wrong", "", values),
+            ExplanationRow("the model holds", "", values),
             *(_tabulate_explanation(one, estimates) for one in explanations),
         ],
     )

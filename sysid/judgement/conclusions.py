@@ -109,9 +109,9 @@ def conclude_verdict(
 
 
 def add_reading_notes(found: "Identification", texts: Sequence[str]) -> "Identification":
-    """Add to a result what was noted when its recording was read."""
+    """Add to a result what was noted when its recording was read, after what was found."""
     notes = [note("recording", "record", text) for text in texts]
-    return replace(found, findings=(*found.findings, *notes), warnings=(*texts, *found.warnings))
+    return replace(found, findings=(*found.findings, *notes), warnings=(*found.warnings, *texts))
 
 
 def list_warnings(findings: Sequence[Finding]) -> tuple[str, ...]:
