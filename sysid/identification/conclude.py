@@ -274,6 +274,7 @@ def _build_identification(
         order_comparison=orders,
         delays=tuple(sorted(delays)),
         findings=findings,
+        explained=explained.is_done,
         verdict=conclude_verdict(analysis.estimates, findings, declared),
         warnings=list_warnings(findings),
         substeps=problem.model.solver.substeps,
