@@ -215,7 +215,9 @@ def _free_starts(
         free.get(state.name, start)
         for state, start in zip(model.states, model.initial, strict=True)
     )
-    return problem.rebuild(model=replace(model, initial=initial), weights=problem.output_weights)
+    return problem.rebuild(
+        model=replace(model, initial=initial), initial=None, weights=problem.output_weights
+    )
 
 
 def _join_starts(

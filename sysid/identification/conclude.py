@@ -260,6 +260,7 @@ def _build_identification(
             *(() if posterior is None else describe_posterior(posterior, analysis.estimates)),
         ),
         substeps=problem.model.solver.substeps,
+        initial=None if problem.settings.initial == "auto" else problem.settings.initial,
         selection=() if problem.model.selection is None else problem.model.selection.terms,
         history=_extend_histories(state, best.ends),
         migrations=state.migrations,

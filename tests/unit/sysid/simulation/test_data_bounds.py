@@ -225,7 +225,7 @@ def test_a_recursion_has_no_bounds_of_a_plant() -> None:
         "parameters": {"a": {"lower": 0, "upper": 1, "bounds": "gain"}},
         "equations": {"y": "a*y(k-1)"},
         "outputs": {"y": "y"},
-        "initial": {"y": {"lower": 0, "upper": 1, "bounds": "state"}},
+        "initial": {"y": {"lower": 0, "upper": 1, "bounds": "offset"}},
     }
     with pytest.raises(InvalidModel) as refusal:
         parse_model(document)
