@@ -7,7 +7,7 @@ import numpy as np
 
 from sysid.core.errors import DivergedEverywhere, NothingIdentifiable
 from sysid.core.jit import read_clock
-from sysid.core.settings import GeneticAlgorithm
+from sysid.core.settings import GeneticAlgorithm, StartKind
 from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
 from sysid.data.records import find_common_sample_time
@@ -49,6 +49,7 @@ from sysid.identification.best_estimate import IslandEnd, find_best_estimate, is
 from sysid.identification.budget import Budget
 from sysid.identification.deadline import Clock, Deadline
 from sysid.islands.run_state import RunState
+from sysid.judgement.starts import StartComparison
 from sysid.minima.minima import mark_ambiguous
 from sysid.minima.search_evidence import assess_search, mark_unsettled, warn_unsettled
 from sysid.noise_models.noise_model_choice import resolve_noise_model
@@ -189,7 +190,7 @@ def _build_identification(
         ),
         evaluations=state.evaluations + budget.spent,
         generations=max(island.generation for island in state.islands),
-        islands=_summarise_islands(state, best.ends),
+        islands=_summarise_islands(best.state, best.ends),
         identifiability=_describe_identifiability(uncertainty),
         criteria=analysis.criteria,
         correlation=None
@@ -260,9 +261,9 @@ def _build_identification(
             *(() if posterior is None else describe_posterior(posterior, analysis.estimates)),
         ),
         substeps=problem.model.solver.substeps,
-        initial=None if problem.settings.initial == "auto" else problem.settings.initial,
+        initial=_get_start(asked, best.starts),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
-        history=_extend_histories(state, best.ends),
+        history=_extend_histories(best.state, best.ends),
         migrations=state.migrations,
         simulated=split_outputs(problem, simulated),
         simulated_validation=() if validated is None else validated.simulated,
@@ -274,6 +275,14 @@ def _describe_identifiability(uncertainty: Uncertainty | None) -> Identifiabilit
     if uncertainty is None:
         return Identifiability(None, (), np.zeros(0))
     return Identifiability(uncertainty.condition, uncertainty.groups, uncertainty.singular_values)
+
+
+def _get_start(asked: Problem, starts: StartComparison | None) -> StartKind | None:
+    """Get the start that the estimates assume; None for that of the model's document."""
+    if starts is not None:
+        return starts.own.name
+    initial = asked.settings.initial
+    return None if initial == "auto" else initial
 
 
 def _compute_input_history(problem: Problem) -> tuple[float, ...]:

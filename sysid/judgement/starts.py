@@ -1,0 +1,291 @@
+"""Compare where the states start: at rest, at estimated or at measured values.
+
+A plant that stands still before its record needs no start to be estimated. An estimated one then
+costs precision: in a step test with two samples before the step it takes nearly all that is known
+of the gain. In a record that begins amid a motion the rest is wrong, and moves all estimates. A
+start at the first measured value has the noise of that sample.
+
+So each start is fitted by least squares from the estimate, and again from the end of a better one.
+They are compared by Schwarz's criterion (BIC, 1978) on the same samples. If the residuals with most
+starts free are not white, each start has first-order noise of its own, with the correlation time of
+its largest likelihood. The start of lowest BIC is preferred. Those whose BIC is less than 6 above
+it are open: odds of 20 to 1 (Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773).
+
+A fit whose time lag ends at its upper bound is no explanation, if there is another: its likelihood
+still grows beyond the bound, and the criterion is that of a maximum. Behind half a record of lag, a
+transient from free starts can take the place of the answer to a step.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import isfinite
+
+import numpy as np
+
+from sysid.core.errors import SysidError
+from sysid.core.settings import InitialSetting, StartKind
+from sysid.core.types import FloatArray
+from sysid.diagnosis.warnings import find_delay_parameters
+from sysid.minima.minima import scan_by_projection
+from sysid.models.starts import compares_starts
+from sysid.noise_models.first_order_fit import fit_first_order_noise
+from sysid.residuals.series import is_coloured, iterate_parts
+from sysid.search.refine import RefinedCandidate, refine_candidates
+from sysid.simulation.problem import Problem
+from sysid.simulation.scaling import is_at_bounds, to_unit
+from sysid.simulation.start_values import convert_point
+from sysid.uncertainty.analysis import analyse_estimate, compute_criteria
+
+_KINDS: tuple[StartKind, ...] = ("rest", "measured", "free")
+_OPEN_DISTANCE = 6.0  # of BIC: odds of 20 to 1 (Kass and Raftery 1995)
+_MAX_STEPS = 30  # of least squares, with as many simulations as there are parameters and one
+_FITS = 4  # of a start: from the estimate, from another start, under a noise model, its errors
+_SCAN, _SEED = 1000, 1  # simulations of a scan for a lower minimum of a start that is not open
+_NEGLIGIBLE_SHARE = 1e-3  # of the output: smaller residuals are of the integration, not of noise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedStart:
+    """The fit of one start.
+
+    Attributes
+    ----------
+    name : {"rest", "measured", "free"} or None
+        None: the start of the model's document, if it is none of these.
+    problem : Problem
+        With this start.
+    theta : FloatArray, shape (D,)
+        The estimate by least squares.
+    values, stderrs : mapping of str to float
+        The estimates, and their standard errors if they have one, under the noise of the
+        comparison.
+    rms : float
+        Fitness of `theta`.
+    bic : float
+        Schwarz's criterion under that noise.
+    is_open : bool
+        Whether its odds against the best one are above 1 to 20.
+    """
+
+    name: StartKind | None
+    problem: Problem
+    theta: FloatArray
+    values: Mapping[str, float]
+    stderrs: Mapping[str, float]
+    rms: float
+    bic: float
+    is_open: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StartComparison:
+    """Starts compared on the same samples.
+
+    Attributes
+    ----------
+    fits : tuple of FittedStart
+        That of the problem first.
+    noise_model : {"white", "ar1"}
+    evaluations : int
+        Simulations spent.
+    """
+
+    fits: tuple[FittedStart, ...]
+    noise_model: str
+    evaluations: int
+
+    @property
+    def own(self) -> FittedStart:
+        """The start of the problem."""
+        return self.fits[0]
+
+    @property
+    def preferred(self) -> FittedStart:
+        """The open start of lowest BIC."""
+        return min((fit for fit in self.fits if fit.is_open), key=lambda fit: fit.bic)
+
+    def list_moves(self, fit: FittedStart) -> dict[str, float]:
+        """List how far another start moves each parameter, in standard errors of the own fit."""
+        own = self.own
+        return {
+            name: abs(fit.values[name] - own.values[name]) / stderr
+            for name, stderr in own.stderrs.items()
+            if name in fit.values
+        }
+
+
+def compare_starts(
+    problem: Problem,
+    theta: FloatArray,
+    initial: InitialSetting | None = "auto",
+    max_simulations: int | None = None,
+    is_late: Callable[[], bool] = lambda: False,
+) -> StartComparison | None:
+    """Compare the start of a problem with the others that its model can have.
+
+    None if the request gives the start: by the setting, by the model's document, or by changes of
+    initial states. Also for other fits than least squares of a free run, if the model fits nearly
+    without residuals, or if budget or time do not suffice.
+
+    Parameters
+    ----------
+    problem : Problem
+        With any of the starts.
+    theta : FloatArray, shape (D,)
+        The estimate.
+    initial : {"rest", "free", "measured", "auto"} or None
+        Setting of the request.
+    max_simulations : int or None
+    is_late : callable
+        Whether the time of the run is over.
+    """
+    others = [] if is_late() else _list_other_starts(problem, initial)
+    if not others:
+        return None
+    named = [(_find_name(problem), problem), *others]
+    steps = _MAX_STEPS * (1 + max(len(one.free_parameters) for _, one in named))
+    if max_simulations is not None and max_simulations < _FITS * steps * len(named):
+        return None
+    ends, spent = _fit_starts([one for _, one in named], theta, steps, is_late)
+    known = [(name, one, end) for (name, one), end in zip(named, ends, strict=True) if end]
+    if len(known) < 2 or ends[0] is None or is_late():
+        return None
+    if min(end.rms for _, _, end in known) <= _NEGLIGIBLE_SHARE * problem.output_scale:
+        return None
+    _, largest, end = max(known, key=lambda one: one[2].theta.size)
+    has_colour = problem.loss.noise_model == "ar1" or _has_coloured_residuals(largest, end.theta)
+    fits = list[FittedStart]()
+    for name, one, end in known:
+        fit, count = _assess_start(name, one, end, steps, has_colour=has_colour)
+        fits.append(fit)
+        spent += count
+    inside = [fit for fit in fits if not _is_lag_at_limit(fit)] or fits
+    lowest = min(fit.bic for fit in inside)
+    if not isfinite(lowest):
+        return None
+    marked = (
+        replace(fit, is_open=fit in inside and fit.bic < lowest + _OPEN_DISTANCE) for fit in fits
+    )
+    return StartComparison(tuple(marked), "ar1" if has_colour else "white", spent)
+
+
+def _list_other_starts(
+    problem: Problem, initial: InitialSetting | None
+) -> list[tuple[StartKind | None, Problem]]:
+    """List the problems with other starts, unless the request says where the states start."""
+    if (
+        not compares_starts(problem.given_model, initial)
+        or problem.loss.kind != "squares"
+        or problem.prediction != "simulation"
+    ):
+        return []
+    states = {state.name for state in problem.model.states}
+    if any(name.partition("(")[0] in states for name in problem.settings.parameters):
+        return []
+    problems = list[tuple[StartKind | None, Problem]]()
+    kinds: tuple[InitialSetting, ...] = ("auto", *_KINDS)
+    for kind in kinds:
+        try:
+            other = problem.rebuild(initial=kind)
+        except SysidError:  # the model has no such start
+            continue
+        if all(_starts_differ(other, one) for one in (problem, *(one for _, one in problems))):
+            problems.append((_find_name(other), other))
+    return problems
+
+
+def _starts_differ(first: Problem, second: Problem) -> bool:
+    return first.model.initial != second.model.initial
+
+
+def _find_name(problem: Problem) -> StartKind | None:
+    """Find the name of a problem's starts; None if they are those of the document only."""
+    for kind in _KINDS:
+        if problem.settings.initial == kind:
+            return kind
+        try:
+            if not _starts_differ(problem, problem.rebuild(initial=kind)):
+                return kind
+        except SysidError:
+            continue
+    return None
+
+
+def _fit_starts(
+    problems: Sequence[Problem], theta: FloatArray, steps: int, is_late: Callable[[], bool]
+) -> tuple[list[RefinedCandidate | None], int]:
+    """Fit problems from an estimate of the first, then from the best end of the others."""
+    points = [convert_point(problems[0], one, theta) for one in problems]
+    ends = [
+        refine_candidates(one, [point], steps, is_late)[0]
+        for one, point in zip(problems, points, strict=True)
+    ]
+    spent = sum(end.evaluations for end in ends if end)
+    for i, one in enumerate(problems):
+        others = [
+            convert_point(other, one, end.theta)
+            for other, end in zip(problems, ends, strict=True)
+            if other is not one and end
+        ]
+        own = ends[i]
+        for candidate in refine_candidates(one, others, steps, is_late) if others else ():
+            if candidate is None:
+                continue
+            spent += candidate.evaluations
+            if own is None or candidate.rms < own.rms:
+                ends[i] = own = candidate
+    best = min(end.rms for end in ends if end) if any(ends) else 0.0
+    for i, (one, end) in enumerate(zip(problems, ends, strict=True)):
+        if end is None or end.rms <= best * _compute_open_ratio(one):
+            continue
+        scanned = scan_by_projection(one, end, _SEED, _SCAN, is_late)
+        spent += scanned.evaluations
+        ends[i] = min((end, *scanned.ends), key=lambda found: found.rms)
+    return ends, spent
+
+
+def _compute_open_ratio(problem: Problem) -> float:
+    """Compute how far above the best RMS a fit with one parameter less is open, in white noise."""
+    n = problem.n_scored
+    return float(np.exp(0.5 * (_OPEN_DISTANCE + np.log(n)) / n))
+
+
+def _is_lag_at_limit(fit: FittedStart) -> bool:
+    point = to_unit(fit.problem.evaluator, fit.theta[None])[0]
+    delays = find_delay_parameters(fit.problem)
+    pairs = zip(fit.problem.free_names, is_at_bounds(point)[1], strict=True)
+    return any(at_upper for name, at_upper in pairs if name in delays)
+
+
+def _has_coloured_residuals(problem: Problem, theta: FloatArray) -> bool:
+    residuals = problem.compute_residuals(theta[None])[0]
+    return any(is_coloured(part, residuals[part.rows]) for part in iterate_parts(problem))
+
+
+def _assess_start(
+    name: StartKind | None,
+    problem: Problem,
+    end: RefinedCandidate,
+    steps: int,
+    *,
+    has_colour: bool,
+) -> tuple[FittedStart, int]:
+    """Compute the BIC of a fit, and its errors; count the simulations."""
+    theta, whitening, spent = end.theta, None, 1
+    if has_colour:
+        theta, whitening, spent = fit_first_order_noise(problem, theta, steps)
+    with np.errstate(all="ignore"):  # a start may have no effect on the output
+        residuals = problem.compute_residuals(theta[None])[0]
+        analysis = analyse_estimate(problem, theta, whitening=whitening)
+    if whitening is not None:
+        residuals = whitening.whiten(residuals)
+    fit = FittedStart(
+        name,
+        problem,
+        end.theta,
+        {estimate.name: estimate.value for estimate in analysis.estimates},
+        {one.name: one.stderr for one in analysis.estimates if one.stderr},
+        end.rms,
+        compute_criteria(problem, residuals, whitening).bic,
+    )
+    return fit, spent + analysis.evaluations
