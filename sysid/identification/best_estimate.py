@@ -305,6 +305,8 @@ class _EstimateSearch:
         if not self._refines:
             return False
         self._choose_best()
+        if self._is_start_compared():
+            return False
         most = self._budget.count_left(self._reserved)
         late = self._deadline.is_past_grace
         self.starts = compare_starts(self.problem, self.theta, self._initial, most, late)
@@ -315,12 +317,19 @@ class _EstimateSearch:
         if best is self.starts.own or best.name in self._left:
             return False
         self._left.append(self.starts.own.name)
+        self.starts = self.starts.take(best)
         self._use_start(best)
         return True
 
+    def _is_start_compared(self) -> bool:
+        """Whether the starts were compared at this estimate."""
+        if self.starts is None or self.starts.own.problem is not self.problem:
+            return False
+        return is_same_point(self.problem, self.starts.own.theta, self.theta)
+
     def _use_start(self, best: FittedStart) -> None:
         """Continue with another start from the ends of all islands."""
-        before, self.problem = self.problem, best.problem
+        before, self.problem, self._scanned = self.problem, best.problem, None
         self.state = convert_state(before, best.problem, self.state)
         points = [convert_point(before, best.problem, end.theta) for end in self.ends]
         points[self._best] = best.theta
