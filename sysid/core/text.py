@@ -68,6 +68,18 @@ def format_estimate(value: float, stderr: float | None, *, status: str = "") -> 
     return rounded[0], rounded[1]
 
 
+def join_names(names: Sequence[str]) -> str:
+    """Join names as a sentence lists them.
+
+    Examples
+    --------
+    >>> join_names(["K", "T", "L"])
+    'K, T and L'
+    """
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last
+
+
 def join_estimate(value: float, stderr: float | None, *, status: str = "") -> str:
     """Format an estimate and its standard error as one text, ``0.1193 ± 0.0004``."""
     return " ± ".join(filter(None, format_estimate(value, stderr, status=status)))

@@ -13,17 +13,6 @@ import numpy as np
 
 from sysid.core.settings import GeneticAlgorithm, StartKind
 from sysid.core.types import FloatArray
-from sysid.diagnosis.integration_step import (
-    HalfStep,
-    choose_starts,
-    compare_half_step,
-    compute_work_limit,
-    find_limit,
-    mark_changing,
-)
-from sysid.diagnosis.unrecorded_input import RecordedComparison, compare_where_recorded
-from sysid.diagnosis.validation import simulate_validation
-from sysid.diagnosis.warnings import find_delay_parameters
 from sysid.identifiability.exchange import (
     ExchangeGroups,
     find_exchanges,
@@ -34,11 +23,22 @@ from sysid.identification.deadline import Deadline
 from sysid.identification.state_conversion import convert_state
 from sysid.islands.run_state import RunState
 from sysid.islands.stopping import count_restarts
+from sysid.judgement.integration_step import (
+    HalfStep,
+    choose_starts,
+    compare_half_step,
+    compute_work_limit,
+    find_limit,
+    mark_changing,
+)
+from sysid.judgement.judge import Explained, explain_residuals
+from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
 from sysid.judgement.starts import (
     FittedStart,
     StartComparison,
     compare_starts,
 )
+from sysid.judgement.unrecorded_input import RecordedComparison, compare_where_recorded
 from sysid.minima.local_minima import (
     LocalMinima,
     count_affordable_simulations,
@@ -60,12 +60,6 @@ from sysid.noise_models.generalised_least_squares import (
     GeneralisedEstimate,
     fit_generalised_least_squares,
 )
-from sysid.noise_models.noise_model_choice import (
-    PredictionErrors,
-    compare_on_blocks,
-    explain_noise_model_choice,
-    may_be_ar1,
-)
 from sysid.residuals.residual_tests import run_residual_tests
 from sysid.residuals.series import make_whitening
 from sysid.residuals.whitening import Whitening
@@ -73,7 +67,7 @@ from sysid.search.archive import read_archive
 from sysid.search.island import Island, compute_analysis_budget, get_island_settings
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.search.state import SAME_OPTIMUM
-from sysid.simulation.problem import Problem, compute_metrics
+from sysid.simulation.problem import Problem
 from sysid.simulation.start_values import convert_point
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
@@ -126,6 +120,8 @@ class BestEstimate:
         The estimate under the noise model.
     analysis : Analysis
         Of that estimate.
+    explained : Explained
+        What explains the residuals of least squares.
     starts : StartComparison or None
         The start that the estimate assumes, and the others; None if they were not compared.
     state : RunState
@@ -138,6 +134,7 @@ class BestEstimate:
     first: tuple[Estimate, ...]
     noise: GeneralisedEstimate
     analysis: Analysis
+    explained: Explained
     starts: StartComparison | None
     state: RunState
 
@@ -159,11 +156,12 @@ def find_best_estimate(
     state: RunState,
     budget: Budget,
     deadline: Deadline,
-    validation: Problem | None = None,
+    *,
+    explains: bool,
 ) -> BestEstimate:
     """Find the best estimate of a search that has ended, and analyse it.
 
-    Validation data decide on the noise model, if that is asked for.
+    Residuals are explained if that is asked for, or if a noise model depends on it.
 
     The integration step is halved until the estimates and their errors stand still, or until a
     limit is reached. Then those that still change are not identified, or have the change in their
@@ -190,7 +188,8 @@ def find_best_estimate(
         first = first or estimates
     changes = {} if half is None else half.changes
     recorded = search.compare_where_recorded()  # a noise model would hide a contradiction
-    noise = search.apply_noise_model(validation, is_settled=not changes)
+    explained = search.explain(explains=explains)
+    noise = search.apply_noise_model(explained, is_settled=not changes)
     minima = search.collect_minima(recorded)
     marked = mark_changing(search.analysis.estimates, half, limit)
     marked = mark_poor_intervals(search.problem.free_parameters, marked)
@@ -202,6 +201,7 @@ def find_best_estimate(
         first,
         noise,
         analysis,
+        explained,
         search.starts,
         search.state,
     )
@@ -387,39 +387,43 @@ class _EstimateSearch:
         self._work -= self.problem.n_steps * (fitted + spent)
         return ""
 
-    def apply_noise_model(
-        self, validation: Problem | None, *, is_settled: bool
-    ) -> GeneralisedEstimate:
+    def explain(self, *, explains: bool) -> Explained:
+        """Explain the residuals of least squares, if asked for or if their colour needs it."""
+        if not (explains or self._may_be_ar1()):
+            return Explained()
+        context = ResidualContext(self.problem, self.theta, self.analysis)
+        explained = explain_residuals(context)
+        self._budget.spend(len(context.spent))
+        return explained
+
+    def apply_noise_model(self, explained: Explained, *, is_settled: bool) -> GeneralisedEstimate:
         """Estimate and analyse under the noise model that was requested or selected.
 
-        Estimates of the paper's methods stay unchanged. So do all if the residuals are consistent
-        with white noise, or if the integration step is too long for them (not `is_settled`).
+        ``auto`` selects it for coloured residuals that nothing but noise explains. Estimates of
+        the paper's methods stay unchanged. So do all if the residuals are consistent with white
+        noise, or if the integration step is too long for them (not `is_settled`).
         """
         requested, squares = self.problem.loss.noise_model, GeneralisedEstimate(self.theta, {}, 0)
         if requested == "white" or not self._refines:
             return squares._replace(is_complete=requested != "ar1")
         if requested == "ar1":
             return self._use_noise_model()
-        if not (is_settled and may_be_ar1(self.problem, self.analysis)):
+        if not (is_settled and self._may_be_ar1() and explained.is_noise):
             return squares
-        return self._choose_noise_model(validation) or squares
-
-    def _choose_noise_model(self, validation: Problem | None) -> GeneralisedEstimate | None:
-        """Estimate under first-order noise if that predicts better; else None, as it was."""
-        before, theta, errors = self.analysis, self.theta, None
-        if validation is None:
-            most = self._count_noise_simulations()
-            errors = compare_on_blocks(self.problem, theta, most)
-            self._budget.spend(0 if errors is None else errors.evaluations)
-            if errors is None or not errors.speak_for_ar1:
-                return None
+        before = self.analysis
         estimate = self._use_noise_model()
-        if validation is not None:
-            errors = self._compare_on_validation(validation, before)
-        if errors is None or not (errors.speak_for_ar1 and estimate.is_complete):
-            self.analysis = before
-            return None
-        return estimate._replace(note=explain_noise_model_choice(self.problem, theta, errors))
+        if estimate.is_complete:
+            return estimate
+        self.analysis = before
+        return squares
+
+    def _may_be_ar1(self) -> bool:
+        """Whether the residuals of a free run by squares are coloured: else there is no choice."""
+        problem, uncertainty = self.problem, self.analysis.uncertainty
+        is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
+        is_asked = problem.loss.noise_model == "auto" and self._refines
+        colour = "white" if uncertainty is None else uncertainty.noise_colour
+        return is_free and is_asked and colour in ("coloured", "drifting")
 
     def _use_noise_model(self) -> GeneralisedEstimate:
         """Estimate under first-order noise, and analyse, if the residuals are not white."""
@@ -445,17 +449,6 @@ class _EstimateSearch:
             state.seconds, state.evaluations, self.problem.n_steps
         )
         return min((limit for limit in (left, in_time) if limit is not None), default=None)
-
-    def _compare_on_validation(self, validation: Problem, before: Analysis) -> PredictionErrors:
-        """Compare least squares, analysed `before`, with the present estimate."""
-        white, ar1 = (
-            compute_metrics(run.problem, run.simulated).rms
-            for run in (
-                simulate_validation(validation, self.problem, analysis.estimates)
-                for analysis in (before, self.analysis)
-            )
-        )
-        return PredictionErrors(white, ar1, 0)
 
     def compare_where_recorded(self) -> RecordedComparison:
         """Compare minima where the input is recorded, if the data contradict what is assumed."""

@@ -1,5 +1,6 @@
 """Conclude a search: refinement, uncertainty, validation, warnings."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from math import inf
 
@@ -9,59 +10,57 @@ from sysid.core.errors import DivergedEverywhere, NothingIdentifiable
 from sysid.core.jit import read_clock
 from sysid.core.settings import GeneticAlgorithm, StartKind
 from sysid.core.threads import use_one_thread
-from sysid.core.types import FloatArray
 from sysid.data.records import find_common_sample_time
-from sysid.diagnosis.fixed_start import warn_fixed_starts
-from sysid.diagnosis.hard_switching import warn_hard_switching
-from sysid.diagnosis.input_hold import (
-    describe_input_holds,
-    find_hold_doubts,
-    list_input_holds,
-    mark_hold_dependent,
-    refit_other_holds,
-)
-from sysid.diagnosis.integration_step import explain_finer_step
-from sysid.diagnosis.process_order import (
-    compare_orders,
-    mark_order_dependent,
-    warn_other_order,
-)
-from sysid.diagnosis.unstable_run import (
-    compare_one_step,
-    mark_prediction_dependent,
-    warn_misled_run,
-)
-from sysid.diagnosis.validation import (
-    mark_refuted,
-    split_outputs,
-    validate_estimates,
-    warn_refuted,
-    warn_still_validation,
-)
-from sysid.diagnosis.warnings import (
-    collect_warnings,
-    find_delay_parameters,
-    warn_noise_model,
-    warn_time_limit,
-)
 from sysid.identifiability.exchange import describe_exchanges
 from sysid.identification.best_estimate import IslandEnd, find_best_estimate, is_refining
 from sysid.identification.budget import Budget
 from sysid.identification.deadline import Clock, Deadline
 from sysid.islands.run_state import RunState
-from sysid.judgement.starts import StartComparison
+from sysid.judgement.agreement import find_constant_outputs, find_disagreement
+from sysid.judgement.conclusions import (
+    conclude_estimates,
+    conclude_verdict,
+    list_warnings,
+    order_findings,
+)
+from sysid.judgement.determination import find_ambiguous, find_undetermined
+from sysid.judgement.hard_switching import find_hard_switches
+from sysid.judgement.input_hold import (
+    find_hold_doubts,
+    find_other_readings,
+    list_input_holds,
+    refit_other_holds,
+)
+from sysid.judgement.integration_step import find_finer_step
+from sysid.judgement.judge import select_explanations
+from sysid.judgement.levels import SOLVER_SHARE
+from sysid.judgement.noise_findings import find_feedback, find_noise_model, find_unexplained
+from sysid.judgement.preparation import (
+    find_early_responses,
+    find_few_repeats,
+    find_unit_faults,
+    find_useless_prediction,
+)
+from sysid.judgement.process_order import compare_orders, find_other_orders
+from sysid.judgement.residual_context import find_delay_parameters
+from sysid.judgement.settling import find_rough_end, find_unsettled
+from sysid.judgement.starts import StartComparison, find_open_starts
+from sysid.judgement.unrecorded_input import find_unrecorded_input
+from sysid.judgement.unstable_run import (
+    compare_one_step,
+    find_misled_run,
+)
+from sysid.judgement.validation import find_contradictions, split_outputs, validate_estimates
 from sysid.minima.minima import mark_ambiguous
-from sysid.minima.search_evidence import assess_search, mark_unsettled, warn_unsettled
-from sysid.noise_models.noise_model_choice import resolve_noise_model
-from sysid.residuals.feedback import describe_feedback
+from sysid.minima.search_evidence import assess_search, is_explained
+from sysid.noise_models.generalised_least_squares import resolve_noise_model
 from sysid.residuals.onset_delay import estimate_onset_delays
-from sysid.residuals.residual_tests import list_residual_series, run_residual_tests
+from sysid.residuals.residual_tests import run_residual_tests
+from sysid.results.findings import Finding, note
 from sysid.results.identification import Identification
 from sysid.results.result import Agreements, FitPercent, Identifiability, KnownBefore
-from sysid.results.verdict import Evidence, judge_result
 from sysid.search.state import Improvement, IslandSummary
 from sysid.simulation.problem import Problem, compute_metrics
-from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.estimates import CorrelationMatrix, Uncertainty
 from sysid.uncertainty.posterior import describe_posterior, sample_posterior
 from sysid.uncertainty.unequal_noise import describe_unequal_noise
@@ -119,7 +118,7 @@ def _build_identification(
     compares_orders: bool,
 ) -> Identification:
     budget = Budget(algorithm.stop.evaluations, state.evaluations)
-    best = find_best_estimate(problem, algorithm, state, budget, deadline, validation)
+    best = find_best_estimate(problem, algorithm, state, budget, deadline, explains=compares_orders)
     asked, noise, minima, analysis = problem, best.noise, best.minima, best.analysis
     problem, theta = resolve_noise_model(best.problem, noise), noise.theta
     if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():
@@ -139,29 +138,27 @@ def _build_identification(
     )
     limit = algorithm.safe_limit
     evidence = assess_search(problem, state, metrics.rms, tests, minima)
-    settled = mark_unsettled(mark_ambiguous(problem, analysis.estimates, minima), evidence)
-    analysis = replace(analysis, estimates=mark_refuted(settled, validated))
+    analysis = replace(analysis, estimates=mark_ambiguous(problem, analysis.estimates, minima))
+    delays, explained = find_delay_parameters(problem), best.explained
+    refines = is_refining(algorithm, len(best.ends))
     holds = list_input_holds(problem)
-    if is_refining(algorithm, len(best.ends)):
+    if refines:
         left, late = budget.count_left(), deadline.is_past_grace
         holds, spent = refit_other_holds(problem, holds, theta, best.lowest_end.theta, left, late)
         budget.spend(spent)
     orders = None
-    if compares_orders and is_refining(algorithm, len(best.ends)):
+    if compares_orders and refines:
         left, late = budget.count_left(), deadline.is_past_grace
         orders, spent = compare_orders(problem, theta, analysis.estimates, left, late)
         budget.spend(spent)
-        analysis = replace(analysis, estimates=mark_order_dependent(analysis, orders))
     doubts = find_hold_doubts(problem, holds, simulated, best.lowest_end.rms)
-    hold_marked = mark_hold_dependent(analysis.estimates, holds, doubts)
-    analysis = replace(analysis, estimates=hold_marked)
     posterior = None
     if has_posterior:
         others = [minimum.values for minimum in minima.minima if minimum.is_compatible]
         left, late = budget.count_left(), deadline.is_past_grace
         posterior = sample_posterior(problem, theta, analysis, others, state.seed, left, late)
         budget.spend(posterior.evaluations)
-    feedback = _check_feedback(problem, simulated, analysis)
+    feedback = list(find_feedback(problem, simulated, analysis))
     left, late = budget.count_left(), deadline.is_past_grace
     ahead, spent = compare_one_step(
         problem,
@@ -173,12 +170,73 @@ def _build_identification(
         doubtful=[hold for hold, doubt in zip(holds, doubts, strict=True) if doubt],
     )
     budget.spend(spent)
-    analysis = replace(analysis, estimates=mark_prediction_dependent(analysis.estimates, ahead))
+    estimates, rms = analysis.estimates, best.lowest_end.rms
+    are_noise = is_explained(
+        problem,
+        metrics.rms,
+        run_residual_tests(problem, simulated, "estimation") if any(times.values()) else tests,
+    )
+    is_of_the_solver = metrics.rms <= SOLVER_SHARE * problem.output_scale
+    findings = order_findings(
+        [
+            *find_disagreement(metrics, limit, are_residuals_noise=are_noise),
+            *find_constant_outputs(problem),
+            *find_unsettled(evidence, estimates),
+            *find_contradictions(problem, metrics, validated, estimates),
+            *find_misled_run(estimates, ahead),
+            *select_explanations(
+                () if is_of_the_solver else explained.findings,
+                [
+                    *find_other_orders(orders, problem.model.name, estimates),
+                    *find_other_readings(problem, holds, doubts, estimates, rms),
+                    *find_open_starts(best.starts, estimates),
+                ],
+            ),
+            *find_ambiguous(estimates),
+            *find_undetermined(problem, analysis, delays, are_residuals_noise=are_noise),
+            *find_early_responses(problem),
+            *find_unrecorded_input(problem, analysis, is_contradicted=minima.is_contradicted),
+            *(() if is_of_the_solver else find_unexplained(tests, explained, analysis)),
+            *feedback,
+            *find_unit_faults(problem),
+            *find_useless_prediction(problem),
+            *find_few_repeats(problem, analysis),
+            *_list_notes("unequal noise", describe_unequal_noise(problem, metrics.channels)),
+            *_list_notes(
+                "exchange",
+                describe_exchanges(
+                    problem,
+                    analysis.exchanges,
+                    {one.name for one in estimates if one.stderr is not None},
+                ),
+            ),
+            *find_hard_switches(problem, theta, _list_final_rms(best.ends)),
+            *find_rough_end(
+                algorithm,
+                0.0 if is_of_the_solver else analysis.possible_gain,
+                is_cut_short=any(end.is_cut_short for end in best.ends),
+                lacks_neighbours=analysis.is_cut_short,
+            ),
+            *find_finer_step(asked, problem, best.first, estimates),
+            *find_noise_model(
+                problem,
+                times,
+                best.lowest_end.theta,
+                is_complete=noise.is_complete,
+                is_chosen=asked.loss.noise_model == "auto",
+            ),
+            *_list_notes(
+                "posterior", () if posterior is None else describe_posterior(posterior, estimates)
+            ),
+        ]
+    )
+    analysis = replace(analysis, estimates=conclude_estimates(estimates, findings))
+    declared = [parameter.name for parameter in problem.model.parameters]
     fit = FitPercent(
         metrics.fit_percent, None if validated is None else validated.metrics.fit_percent
     )
     valid = limit is None or metrics.rms <= limit
-    delays, uncertainty = tuple(sorted(find_delay_parameters(problem))), analysis.uncertainty
+    uncertainty = analysis.uncertainty
     return Identification(
         valid=valid,
         parameters=analysis.estimates,
@@ -216,50 +274,10 @@ def _build_identification(
         search=evidence,
         posterior=posterior,
         order_comparison=orders,
-        delays=delays,
-        verdict=judge_result(
-            Evidence(
-                estimates=analysis.estimates,
-                valid=valid,
-                fit_percent=fit.estimation,
-                fit_percent_validation=fit.validation,
-                search=evidence,
-                tests=tests.tests,
-                delays=delays,
-                orders=orders,
-                channels=metrics.channels,
-            )
-        ),
-        warnings=(
-            *warn_refuted(metrics, validated),
-            *warn_other_order(orders, problem.model.name),
-            *warn_fixed_starts(problem, theta, analysis, deadline.is_past_grace),
-            *collect_warnings(
-                problem,
-                algorithm,
-                analysis,
-                metrics,
-                tests,
-                is_contradicted=minima.is_contradicted,
-            ),
-            *describe_unequal_noise(problem, metrics.channels),
-            *warn_unsettled(evidence),
-            *describe_input_holds(problem, holds, doubts, analysis.estimates, best.lowest_end.rms),
-            *describe_exchanges(
-                problem,
-                analysis.exchanges,
-                {estimate.name for estimate in analysis.estimates if estimate.stderr is not None},
-            ),
-            *warn_hard_switching(problem, theta, _list_final_rms(best.ends)),
-            *warn_still_validation(problem, metrics, validated),
-            *warn_time_limit(any(end.is_cut_short for end in best.ends)),
-            *feedback,
-            *warn_misled_run(analysis.estimates, ahead),
-            *explain_finer_step(asked, problem, best.first, analysis.estimates),
-            *warn_noise_model(problem, times, noise.is_complete),
-            *filter(None, [noise.note]),
-            *(() if posterior is None else describe_posterior(posterior, analysis.estimates)),
-        ),
+        delays=tuple(sorted(delays)),
+        findings=findings,
+        verdict=conclude_verdict(analysis.estimates, findings, declared),
+        warnings=list_warnings(findings),
         substeps=problem.model.solver.substeps,
         initial=_get_start(asked, best.starts),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
@@ -294,13 +312,8 @@ def _compute_input_history(problem: Problem) -> tuple[float, ...]:
     )
 
 
-def _check_feedback(problem: Problem, simulated: FloatArray, analysis: Analysis) -> list[str]:
-    """Describe feedback from outputs to inputs; with white residuals it does no harm."""
-    uncertainty = analysis.uncertainty
-    if uncertainty is not None and uncertainty.noise_colour == "white":
-        return []
-    advises = problem.prediction == "simulation" and problem.loss.noise_model != "ar1"
-    return describe_feedback(list_residual_series(problem, simulated), advises_noise_model=advises)
+def _list_notes(explanation: str, texts: Iterable[str]) -> list[Finding]:
+    return [note(explanation, "numerics", text) for text in texts]
 
 
 def _summarise_islands(state: RunState, ends: tuple[IslandEnd, ...]) -> tuple[IslandSummary, ...]:

@@ -7,7 +7,6 @@ from sysid.core.distributions import load_in_background
 from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss
 from sysid.core.text import rewrite_settings
 from sysid.data.records import Record
-from sysid.diagnosis.warnings import warn_constant_outputs
 from sysid.identification.conclude import conclude_run
 from sysid.identification.fit_problems import build_problems, prepare_records
 from sysid.identification.fitted_data import collect_fitted_data
@@ -23,6 +22,8 @@ from sysid.identification.options import RunOptions
 from sysid.identification.request import IdentificationRequest, accept_fields
 from sysid.identification.run import advance_run, begin_run, is_finished
 from sysid.islands.run_state import RunState
+from sysid.judgement.agreement import find_constant_outputs
+from sysid.judgement.conclusions import list_warnings
 from sysid.models.catalogue.load import resolve_model
 from sysid.models.model import Model
 from sysid.models.model_delays import check_unused_settings
@@ -182,7 +183,7 @@ def identify_records(
     problem, validation_problem = problems = build_problems(model, prepared, fit)
     check_warm(options.warm, [parameter.name for parameter in problem.all_parameters])
     if tell is not None:
-        tell(warn_constant_outputs(problem))
+        tell(list_warnings(list(find_constant_outputs(problem))))
     load_in_background()  # the conclusion needs them
     state = begin_run(problem, algorithm, options.seed, options.warm)
     while not is_finished(algorithm, state):

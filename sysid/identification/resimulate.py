@@ -13,8 +13,8 @@ from sysid.core.errors import InvalidSettings
 from sysid.core.settings import FitSettings, InitialSetting
 from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
-from sysid.diagnosis.validation import simulate_validation, split_outputs
 from sysid.identification.fit_problems import FitRecords, build_problems
+from sysid.judgement.validation import simulate_validation, split_outputs
 from sysid.models.model import Model, replace_substeps
 from sysid.uncertainty.estimates import Estimate
 

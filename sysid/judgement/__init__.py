@@ -1,1 +1,1 @@
-"""What speaks against an estimate: explanations of the data that are compared with it."""
+"""What speaks against an estimate: start, past, hold, step, order, suspects, validation."""

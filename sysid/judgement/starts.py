@@ -8,7 +8,9 @@ So each start is fitted by least squares from the estimate, and again from the e
 They are compared by Schwarz's criterion (BIC, 1978) on the same samples. If the residuals with most
 starts free are not white, each start has first-order noise of its own, with the correlation time of
 its largest likelihood. The start of lowest BIC is preferred. Those whose BIC is less than 6 above
-it are open: odds of 20 to 1 (Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773).
+it are open: odds of 20 to 1 (Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773). One that has
+more parameters is so only if its likelihood gains more than by chance (Wilks 1938): otherwise
+nothing speaks for it, and every short record would leave it open.
 
 A fit whose time lag ends at its upper bound is no explanation, if there is another: its likelihood
 still grows beyond the bound, and the criterion is that of a maximum. Behind half a record of lag, a
@@ -26,28 +28,33 @@ from math import isfinite
 
 import numpy as np
 
+from sysid.core.distributions import chi_square_limit
 from sysid.core.errors import InvalidSettings, SysidError
 from sysid.core.settings import InitialSetting, StartKind
+from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
-from sysid.diagnosis.warnings import find_delay_parameters
+from sysid.judgement.levels import NOTABLE_MOVE, STRONG_ODDS
+from sysid.judgement.residual_context import find_delay_parameters
 from sysid.minima.minima import scan_by_projection
 from sysid.models.model import Model
 from sysid.models.starts import compares_starts, replace_starts
 from sysid.noise_models.first_order_fit import fit_first_order_noise
 from sysid.residuals.series import is_coloured, iterate_parts
+from sysid.results.findings import Finding, Move
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import is_at_bounds, to_unit
 from sysid.simulation.start_values import convert_point
 from sysid.uncertainty.analysis import analyse_estimate, compute_criteria
-from sysid.uncertainty.estimates import Criteria
+from sysid.uncertainty.estimates import Criteria, Estimate
 
 _COMPARED: tuple[StartKind, ...] = ("rest", "free")
 _NAMED: tuple[StartKind, ...] = (*_COMPARED, "measured")
-_OPEN_DISTANCE = 6.0  # of BIC: odds of 20 to 1 (Kass and Raftery 1995)
+_CHANCE = 0.05  # of a gain of the likelihood by more parameters alone
 _MAX_STEPS = 30  # of least squares, with as many simulations as there are parameters and one
 _FITS = 4  # of a start: from the estimate, from another start, under a noise model, its errors
 _SCAN, _SEED = 1000, 1  # simulations of a scan for a lower minimum of a start that is not open
+_MOST_TOLD = 3  # moves in a sentence
 _NEGLIGIBLE_SHARE = 1e-3  # of the output: smaller residuals are of the integration, not of noise
 
 
@@ -120,20 +127,77 @@ class StartComparison:
         """Return the comparison as that of a problem with another of these starts."""
         return replace(self, fits=(fit, *(one for one in self.fits if one is not fit)))
 
-    def compute_gain(self, fit: FittedStart) -> float:
-        """Compute the likelihood ratio 2 (ln ℓ - ln ℓ₀) of another start over the own one."""
-        own = self.own.criteria
-        more = fit.criteria.parameters - own.parameters
-        return own.aic - fit.criteria.aic + 2.0 * more
+    def list_moves(self, fit: FittedStart, estimates: Sequence[Estimate]) -> tuple[Move, ...]:
+        """List how another start moves the estimates, the furthest first.
 
-    def list_moves(self, fit: FittedStart) -> dict[str, float]:
-        """List how far another start moves each parameter, in standard errors of the own fit."""
-        own = self.own
-        return {
-            name: abs(fit.values[name] - own.values[name]) / stderr
-            for name, stderr in own.stderrs.items()
-            if name in fit.values
-        }
+        Moves are those between the fits of this comparison, in the errors of the estimates.
+        """
+        own = self.own.values
+        moves = [
+            Move(
+                one.name,
+                fit.values[one.name],
+                fit.stderrs.get(one.name),
+                (fit.values[one.name] - own[one.name]) / one.stderr,
+            )
+            for one in estimates
+            if one.stderr and one.name in fit.values and one.name in own
+        ]
+        return tuple(sorted(moves, key=lambda move: -abs(move.stderrs)))
+
+
+def _compute_gain(fit: FittedStart, other: FittedStart) -> float:
+    """Compute the likelihood ratio 2 (ln ℓ - ln ℓ₀) of a fit over another one."""
+    more = fit.criteria.parameters - other.criteria.parameters
+    return other.criteria.aic - fit.criteria.aic + 2.0 * more
+
+
+def _is_open(fit: FittedStart, best: FittedStart) -> bool:
+    """Whether the data do not rule out a fit, and speak for the parameters that it has more."""
+    more = fit.criteria.parameters - best.criteria.parameters
+    if more > 0 and _compute_gain(fit, best) <= chi_square_limit(more, _CHANCE):
+        return False
+    return fit.bic <= best.bic + STRONG_ODDS
+
+
+_NAMES: Mapping[StartKind | None, str] = {
+    "rest": "at rest",
+    "free": "at estimated values",
+    "measured": "at the first measured values",
+    None: "as the model's document says",
+}
+
+
+def find_open_starts(
+    comparison: StartComparison | None, estimates: Sequence[Estimate]
+) -> Iterator[Finding]:
+    """Find other starts that the data do not rule out, and that move an estimate."""
+    if comparison is None:
+        return
+    own = comparison.own
+    for fit in comparison.fits[1:]:
+        moves = comparison.list_moves(fit, estimates)
+        notable = tuple(one.parameter for one in moves if abs(one.stderrs) > NOTABLE_MOVE)
+        if not (fit.is_open and notable):
+            continue
+        units = {one.name: plain_unit(one.unit) for one in estimates}
+        told = [
+            f"{one.parameter} is {plain_estimate(one.value, one.stderr)}{units[one.parameter]}"
+            for one in moves
+            if one.parameter in notable
+        ]
+        yield Finding(
+            "start",
+            "start",
+            "caution",
+            f"the states may start {_NAMES[fit.name]}",
+            f"the estimates assume that the states start {_NAMES[own.name]}. The data do not rule "
+            f"out that they start {_NAMES[fit.name]}. Then {', '.join(told[:_MOST_TOLD])}.",
+            f"Use initial: {fit.name} for that." if fit.name else "",
+            own.bic - fit.bic,
+            moves,
+            notable,
+        )
 
 
 def compare_starts(
@@ -183,12 +247,10 @@ def compare_starts(
         spent += count
     exact = [fit for fit in fits if fit.name != "measured"]
     inside = [fit for fit in exact if not _is_lag_at_limit(fit)] or exact
-    lowest = min(fit.bic for fit in inside)
-    if not isfinite(lowest):
+    best = min(inside, key=lambda fit: fit.bic)
+    if not isfinite(best.bic):
         return None
-    marked = (
-        replace(fit, is_open=fit in inside and fit.bic < lowest + _OPEN_DISTANCE) for fit in fits
-    )
+    marked = (replace(fit, is_open=fit in inside and _is_open(fit, best)) for fit in fits)
     return StartComparison(tuple(marked), "ar1" if has_colour else "white", spent)
 
 
@@ -267,7 +329,7 @@ def _fit_starts(
 def _compute_open_ratio(problem: Problem) -> float:
     """Compute how far above the best RMS a fit with one parameter less is open, in white noise."""
     n = problem.n_scored
-    return float(np.exp(0.5 * (_OPEN_DISTANCE + np.log(n)) / n))
+    return float(np.exp(0.5 * (STRONG_ODDS + np.log(n)) / n))
 
 
 def _is_lag_at_limit(fit: FittedStart) -> bool:

@@ -6,7 +6,6 @@ them. Searches that start near the best individual show nothing: they return to 
 well.
 """
 
-from dataclasses import replace
 from typing import Literal
 
 from sysid.islands.run_state import RunState
@@ -15,7 +14,6 @@ from sysid.minima.minima import FoundMinima
 from sysid.residuals.residual_tests import ResidualTests
 from sysid.results.parts import SearchEvidence
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.estimates import Estimate
 
 _ENOUGH_STARTS = 2  # that agree
 _UNLIKELY = 1e-3  # probability of such residuals if they are noise
@@ -54,35 +52,3 @@ def is_explained(problem: Problem, rms: float, tests: ResidualTests | None) -> b
         return True
     known = [] if tests is None else [test.p for test in tests.tests if test.p is not None]
     return bool(known) and min(known) > _UNLIKELY
-
-
-def mark_unsettled(
-    estimates: tuple[Estimate, ...], evidence: SearchEvidence
-) -> tuple[Estimate, ...]:
-    """Mark the identified estimates of a search that did not settle."""
-    if evidence.settled:
-        return estimates
-    reason = "nothing shows that the search found the best minimum"
-    return tuple(
-        replace(estimate, status="not settled", reason=reason)
-        if estimate.status == "identified"
-        else estimate
-        for estimate in estimates
-    )
-
-
-def warn_unsettled(evidence: SearchEvidence) -> list[str]:
-    """Warn about a search that did not settle."""
-    if evidence.settled:
-        return []
-    agreed = (
-        "it made no independent starts"
-        if evidence.independent_starts == 0
-        else f"{evidence.agreeing_starts} of {evidence.independent_starts} independent starts "
-        "ended in the best minimum"
-    )
-    return [
-        f"the search did not settle: {agreed}, and the residuals are not noise. A better minimum "
-        "may have been missed, or the model is wrong. Repeat it with other seeds, more "
-        "generations or narrower bounds, and compare the RMS."
-    ]

@@ -22,12 +22,14 @@ drifted away, and its offset with it.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.fft import irfft, rfft
 
 from sysid.core.linear_algebra import compute_truncated_svd
+from sysid.core.settings import NoiseModel
 from sysid.core.types import FloatArray
 from sysid.residuals.autocorrelation import space_residuals
 from sysid.residuals.series import ResidualPart, is_coloured, iterate_parts, make_whitening
@@ -68,8 +70,6 @@ class GeneralisedEstimate(NamedTuple):
         Ends of least squares from all starts, including the estimate.
     rms : FloatArray, shape (m,)
         RMS of the whitened residuals there.
-    note : str
-        Why ``auto`` selected the noise model (`sysid.noise_models.noise_model_choice`).
     """
 
     theta: FloatArray
@@ -78,7 +78,6 @@ class GeneralisedEstimate(NamedTuple):
     is_complete: bool = True
     minima: FloatArray = np.zeros((0, 0))
     rms: FloatArray = np.zeros(0)
-    note: str = ""
 
 
 def fit_generalised_least_squares(
@@ -131,6 +130,15 @@ def fit_generalised_least_squares(
     minima = from_unit(problem.evaluator, search.ends)
     complete = not search.is_cut
     return GeneralisedEstimate(theta, times, search.evaluations, complete, minima, search.rms)
+
+
+def resolve_noise_model(problem: Problem, noise: GeneralisedEstimate) -> Problem:
+    """Replace the noise model ``auto`` of a problem by the one that was selected."""
+    if problem.loss.noise_model != "auto":
+        return problem
+    noise_model: NoiseModel = "ar1" if any(noise.correlation_times.values()) else "white"
+    loss = replace(problem.loss, noise_model=noise_model)
+    return replace(problem, settings=replace(problem.settings, loss=loss))
 
 
 def select_coloured_outputs(problem: Problem, error: FloatArray) -> set[str]:

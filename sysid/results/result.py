@@ -19,6 +19,7 @@ from sysid.identifiability.combinations import IdentifiableCombination
 from sysid.models.model import Model, SelectedTerm
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import CorrelationFunction, ResidualTests
+from sysid.results.findings import Finding
 from sysid.results.parts import InputHold, OrderComparison, SearchEvidence
 from sysid.results.verdict import Verdict
 from sysid.search.state import Improvement, IslandSummary, Migrant
@@ -162,10 +163,12 @@ class Result:
         One order less and one more; none if not compared, or no process with dead time.
     delays : tuple of str
         Free parameters that time lags depend on.
+    findings : tuple of Finding
+        What explains the residuals, and what speaks against the estimates; the most severe first.
     verdict : Verdict
-        Whether the estimates can be relied on, with the reasons.
+        Whether the estimates can be relied on.
     warnings : tuple of str
-        What limits the result.
+        The sentences of the findings.
     substeps : int
         Integration steps in one grid step: the model's, or more.
     selection : tuple of SelectedTerm
@@ -200,6 +203,7 @@ class Result:
     posterior: Posterior | None
     order_comparison: OrderComparison | None
     delays: tuple[str, ...]
+    findings: tuple[Finding, ...]
     verdict: Verdict
     warnings: tuple[str, ...]
     substeps: int

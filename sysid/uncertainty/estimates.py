@@ -11,10 +11,8 @@ NoiseColour = Literal["white", "first-order", "coloured", "drifting", "clustered
 EstimateStatus = Literal[
     "identified",
     "not settled",
-    "not validated",
-    "order-dependent",
-    "prediction-dependent",
-    "hold-dependent",
+    "refuted",
+    "dependent",
     "ambiguous",
     "group",
     "at bound",

@@ -13,8 +13,8 @@ import pytest
 from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.diagnosis.process_order import mark_order_dependent, warn_other_order
 from sysid.identification.identify import identify
+from sysid.judgement.process_order import mark_order_dependent, warn_other_order
 from sysid.results.identification import Identification
 from sysid.results.parts import OrderComparison, OrderFit, compare_fits
 from sysid.results.summary import describe_order
@@ -209,7 +209,7 @@ def write_fits(*bics: float) -> OrderComparison:
             [("fopdt", 1, 1.57), ("sopdt", 2, 1.4), ("topdt", 3, 1.3)], bics, strict=True
         )
     )
-    return compare_fits("sopdt", "L", "s", "white", fits)
+    return compare_fits("sopdt", "L", "s", "white", fits, 300)
 
 
 def analyse(estimate: Estimate, colour: NoiseColour = "white") -> Analysis:

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sysid.judgement.warnings import _warn_correlations
 
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.diagnosis.warnings import _warn_correlations
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
 from sysid.results.identification import Identification

@@ -6,26 +6,25 @@ input in straight lines follows the residuals, as a command that a controller co
 Or the samples beside each of its samples say nothing of it, so no line leads there.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from math import log
 
 import numpy as np
 
-from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 from sysid.data.records import Channel, Record
+from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE
 from sysid.kernels.signals.past_reads import is_difference
 from sysid.residuals.feedback import find_commands
 from sysid.residuals.residual_tests import list_residual_series
+from sysid.results.findings import Finding, Move, note
 from sysid.results.parts import InputHold
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
 
-_NOTABLE_STDERRS = 1.0  # standard errors: a larger difference is reported
-_CLEAR_EVIDENCE = 10.0  # twice the logarithm of the ratio of likelihoods
 _MAX_NAMED = 3  # estimates in one sentence
 _MIN_ROUGH = 50  # samples: fewer may be rough by chance
 _READINGS = {"zero": "held", "first": "as straight lines", "band-limited": "band-limited"}
@@ -103,28 +102,15 @@ def find_hold_doubts(
     doubts = []
     for hold, is_open in zip(holds, open_holds, strict=True):
         evidence, doubt = _compute_evidence(hold, problem.n_scored, rms), ""
-        if evidence > _CLEAR_EVIDENCE:
+        if evidence > DEFECT_GAIN:
             doubt = f"That fits better: RMS {hold.rms_other:.4g}, not {rms:.4g}"
-        elif is_open and evidence >= -_CLEAR_EVIDENCE:
+        elif is_open and evidence >= -DEFECT_GAIN:
             if hold.input in commands:
                 doubt = "The input follows the residuals as a command does, which is held"
             elif _is_rough(hold.input, problem.records):
                 doubt = "Its samples do not follow each other, so hardly in straight lines"
         doubts.append(doubt)
     return doubts
-
-
-def mark_hold_dependent(
-    estimates: tuple[Estimate, ...], holds: Sequence[InputHold], doubts: Sequence[str]
-) -> tuple[Estimate, ...]:
-    """Mark identified values whose interval does not hold that of a reading as likely.
-
-    Their standard errors assume the chosen reading.
-    """
-    for hold, doubt in zip(holds, doubts, strict=True):
-        if doubt:
-            estimates = tuple(_mark(estimate, hold) for estimate in estimates)
-    return estimates
 
 
 def replace_holds(problem: Problem, holds: Sequence[InputHold]) -> Problem:
@@ -140,56 +126,64 @@ def write_hold(hold: InputHold) -> str:
     return f"hold: {{{hold.input}: {hold.other}}}"
 
 
-def _mark(estimate: Estimate, hold: InputHold) -> Estimate:
-    other = (hold.estimates_other or {}).get(estimate.name)
-    interval = estimate.interval95
-    if other is None or interval is None or estimate.status != "identified":
-        return estimate
-    if interval[0] <= other <= interval[1]:
-        return estimate
-    value = f"{plain_estimate(other, estimate.stderr)}{plain_unit(estimate.unit)}"
-    reason = f"it is {value} if {hold.input} is read {_READINGS[str(hold.other)]}"
-    return replace(estimate, status="hold-dependent", reason=reason)
-
-
-def describe_input_holds(
+def find_other_readings(
     problem: Problem,
     holds: Sequence[InputHold],
     doubts: Sequence[str],
     estimates: Sequence[Estimate],
     rms: float,
-) -> list[str]:
-    """Describe holds chosen by the data where the choice moves an estimate, or fits worse.
+) -> Iterator[Finding]:
+    """Find holds chosen by the data where the other reading is as likely, or moves an estimate.
 
     That an input is read as straight lines is reported only where that is in doubt.
     """
-    messages = []
     for hold, doubt in zip(holds, doubts, strict=True):
-        moved = _describe_moved_estimates(hold, estimates)
-        is_worse = _compute_evidence(hold, problem.n_scored, rms) > _CLEAR_EVIDENCE
-        if is_worse or (moved and (doubt or hold.chosen == "zero")):
-            why = f". {doubt}" if doubt else ""
+        evidence = _compute_evidence(hold, problem.n_scored, rms)
+        moves = _list_moves(hold, estimates)
+        notable = [move for move in moves if abs(move.stderrs) > NOTABLE_MOVE]
+        if doubt or (notable and hold.chosen == "zero"):
             other = f"{_READINGS[str(hold.other)]} ({write_hold(hold)})"
-            messages.append(
-                f"input {hold.input!r} {hold.reason}, so it is read {_READINGS[hold.chosen]}. "
-                f"Read {other} it would give {moved or 'the same estimates'}{why}"
+            would = _describe_moves(notable, estimates) or "the same estimates"
+            outside = [move.parameter for move in notable if _is_outside(move, estimates)]
+            yield Finding(
+                "reading of an input",
+                "reading",
+                "caution" if doubt and outside else "note",
+                f"{hold.input} may be read {_READINGS[str(hold.other)]}",
+                f"input {hold.input!r} {hold.reason}, so it is read {_READINGS[hold.chosen]}. Read "
+                f"{other} it would give {would}.{f' {doubt}.' if doubt else ''}",
+                f"Use {write_hold(hold)}." if evidence > DEFECT_GAIN else "",
+                evidence,
+                tuple(moves),
+                tuple(outside) if doubt else (),
             )
         if hold.chosen == "zero" and hold.other is not None:
-            messages += _describe_uncertain_jumps(hold.input, problem.records)
-    return messages
+            yield from _find_uncertain_jumps(hold.input, problem.records)
 
 
-def _describe_moved_estimates(hold: InputHold, estimates: Sequence[Estimate]) -> str:
+def _list_moves(hold: InputHold, estimates: Sequence[Estimate]) -> list[Move]:
     moves = []
-    for estimate in estimates:
-        other = (hold.estimates_other or {}).get(estimate.name)
-        if other is not None and estimate.stderr:
-            move = abs(other - estimate.value) / estimate.stderr
-            if move > _NOTABLE_STDERRS:
-                unit = "" if estimate.unit == "1" else f" {estimate.unit}"
-                text = f"{estimate.name} = {other:.4g}{unit} instead of {estimate.value:.4g}"
-                moves.append((-move, text))
-    return ", ".join(text for _, text in sorted(moves)[:_MAX_NAMED])
+    for one in estimates:
+        other = (hold.estimates_other or {}).get(one.name)
+        if other is not None and one.stderr:
+            moves.append(Move(one.name, other, None, (other - one.value) / one.stderr))
+    return sorted(moves, key=lambda move: -abs(move.stderrs))
+
+
+def _is_outside(move: Move, estimates: Sequence[Estimate]) -> bool:
+    """Whether a move leaves the 95 % interval."""
+    interval = next(one.interval95 for one in estimates if one.name == move.parameter)
+    return interval is not None and not interval[0] <= move.value <= interval[1]
+
+
+def _describe_moves(moves: Sequence[Move], estimates: Sequence[Estimate]) -> str:
+    known = {one.name: one for one in estimates}
+    texts = []
+    for move in moves[:_MAX_NAMED]:
+        one = known[move.parameter]
+        unit = "" if one.unit == "1" else f" {one.unit}"
+        texts.append(f"{one.name} = {move.value:.4g}{unit} instead of {one.value:.4g}")
+    return ", ".join(texts)
 
 
 def _compute_evidence(hold: InputHold, samples: int, rms: float) -> float:
@@ -209,19 +203,20 @@ def _is_rough(name: str, records: Sequence[Record]) -> bool:
     return False
 
 
-def _describe_uncertain_jumps(name: str, records: Sequence[Record]) -> list[str]:
+def _find_uncertain_jumps(name: str, records: Sequence[Record]) -> Iterator[Finding]:
     """Say by how much the times of jumps are uncertain where the sampling is irregular."""
     gaps = []
     for channel in _find_channels(name, records):
         if channel.hold == "auto" and not channel.sampling.is_regular:
             jumps = np.flatnonzero(np.diff(channel.values))
             gaps += np.diff(channel.times)[jumps].tolist()
-    if not gaps:
-        return []
-    return [
-        f"input {name!r} is sampled irregularly, and each of its jumps lies between two samples. "
-        f"So a time lag is uncertain by up to one period, {np.median(gaps):.3g} s"
-    ]
+    if gaps:
+        yield note(
+            "irregular sampling",
+            "reading",
+            f"input {name!r} is sampled irregularly, and each of its jumps lies between two "
+            f"samples. So a time lag is uncertain by up to one period, {np.median(gaps):.3g} s",
+        )
 
 
 def _find_channels(name: str, records: Sequence[Record]) -> list[Channel]:

@@ -17,7 +17,7 @@ Without noise the standard errors are so small that no step is short enough. The
 move at the limit is an error of the solver, and is added to the standard error.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import ceil, hypot, inf, log10, sqrt
 
@@ -25,9 +25,10 @@ import numpy as np
 
 from sysid.core.types import RANK_TOLERANCE, FloatArray
 from sysid.core.units import format_unit
-from sysid.diagnosis.unrecorded_input import compute_variances
+from sysid.judgement.unrecorded_input import compute_variances
 from sysid.kernels.signals.past_reads import is_difference
 from sysid.models.model import MAX_SUBSTEPS, replace_substeps
+from sysid.results.findings import Finding, note
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import to_unit
@@ -207,13 +208,13 @@ def _mark_estimate(estimate: Estimate, half: HalfStep, limit: str) -> Estimate:
     )
 
 
-def explain_finer_step(
+def find_finer_step(
     asked: Problem, used: Problem, first: tuple[Estimate, ...], estimates: tuple[Estimate, ...]
-) -> tuple[str, ...]:
-    """Explain why a result is that of a finer step than the model's; `first`: estimates with it."""
+) -> Iterator[Finding]:
+    """Find that a result is that of a finer step than the model's; `first`: estimates with it."""
     wanted, taken = asked.model.solver.substeps, used.model.solver.substeps
     if taken == wanted:
-        return ()
+        return
     before = {estimate.name: estimate for estimate in first}
     changes = [
         f"{_format_estimate(estimate, before[estimate.name])} instead of "
@@ -221,7 +222,9 @@ def explain_finer_step(
         for estimate in estimates
         if estimate.name in before and _differs(estimate, before[estimate.name])
     ]
-    return (
+    yield note(
+        "integration step",
+        "numerics",
         f"the integration step of the model, substeps: {wanted}, is too long for these data. The "
         f"result is that of substeps: {taken}{': ' if changes else ''}{'; '.join(changes)}",
     )

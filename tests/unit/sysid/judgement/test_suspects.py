@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from sysid.judgement.suspects import describe_suspects, find_suspects
 
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.diagnosis.suspects import describe_suspects, find_suspects
 from sysid.models.parse import parse_model
 from sysid.residuals.whitening import Whitening
 from sysid.search.refine import refine_candidates

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sysid.data.records import Channel, Record
-from sysid.diagnosis.hard_switching import warn_hard_switching
+from sysid.judgement.hard_switching import warn_hard_switching
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
 

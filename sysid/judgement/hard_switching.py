@@ -14,6 +14,7 @@ from sysid.core.units import format_unit
 from sysid.language.printer import format_expression
 from sysid.language.tree import Binary, Expression, FunctionCall, PastValue, walk
 from sysid.models.model import Model
+from sysid.results.findings import Finding, note
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit, to_unit
 
@@ -23,20 +24,24 @@ _JUMP_SHARE = 0.5  # of the largest change between two points: of a smooth loss 
 _ROUNDING = 1e-9  # of the loss
 
 
-def warn_hard_switching(problem: Problem, theta: FloatArray, rms: Sequence[float]) -> list[str]:
-    """Warn if the loss jumps near the estimate (D,) and islands ended at different `rms`."""
+def find_hard_switches(
+    problem: Problem, theta: FloatArray, rms: Sequence[float]
+) -> Iterator[Finding]:
+    """Find a loss that jumps near the estimate (D,) if islands ended at different `rms`."""
     finite = [value for value in rms if np.isfinite(value)]
     switch = problem.share("switch", lambda: next(_iterate_switches(problem.model), None))
     if switch is None or not finite or max(finite) <= (1.0 + _DISAGREEMENT) * min(finite):
-        return []
+        return
     if not _has_jumps(problem, theta):
-        return []
-    return [
+        return
+    yield note(
+        "jumps of the loss",
+        "numerics",
         f"the loss jumps because {format_expression(switch)} switches, and the islands ended at "
         f"different minima (RMS {min(finite):.4g} to {max(finite):.4g}{format_unit(problem.unit)})."
         f" Others may be better still. A smooth form has no jumps: {_format_smooth(switch)}, with "
-        "e well below the values between which it switches."
-    ]
+        "e well below the values between which it switches.",
+    )
 
 
 def _iterate_switches(model: Model) -> Iterator[FunctionCall]:

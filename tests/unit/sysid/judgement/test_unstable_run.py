@@ -7,12 +7,12 @@ import pytest
 
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.diagnosis.unstable_run import (
+from sysid.identification.identify import identify
+from sysid.judgement.unstable_run import (
     OneStepComparison,
     compute_growth,
     mark_prediction_dependent,
 )
-from sysid.identification.identify import identify
 from sysid.models.parse import parse_model
 from sysid.results.identification import Identification
 from sysid.simulation.problem import Problem

@@ -10,18 +10,18 @@ from scipy.signal import lfilter
 
 from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, Stop
 from sysid.data.records import Channel, Record
-from sysid.diagnosis import integration_step
-from sysid.diagnosis.integration_step import (
-    HalfStep,
-    choose_starts,
-    compare_half_step,
-    find_limit,
-)
 from sysid.identification.conclude import conclude_run
 from sysid.identification.fit_problems import prepare_records
 from sysid.identification.identify import identify
 from sysid.identification.resimulate import resimulate_run
 from sysid.identification.run import advance_run, begin_run
+from sysid.judgement import integration_step
+from sysid.judgement.integration_step import (
+    HalfStep,
+    choose_starts,
+    compare_half_step,
+    find_limit,
+)
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import MAX_SUBSTEPS, Model, replace_substeps
 from sysid.models.parse import parse_model

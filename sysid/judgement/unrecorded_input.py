@@ -15,7 +15,7 @@ compared again on the samples that read recorded input with every time lag in qu
 if the estimate reads no assumed input, because then no sample supports the assumption.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,79 +28,46 @@ from sysid.data.records import Channel, Record
 from sysid.kernels.signals.past_reads import list_delayed_values
 from sysid.language.functions import Interval
 from sysid.minima.minima import Fit, collect_minima, scan_parameters
-from sysid.models.model import EstimatedInitial
 from sysid.models.model_delays import compute_longest_delay, list_past_values
+from sysid.results.findings import Finding
 from sysid.results.parts import Minimum
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import Analysis, compute_physical_scale
-from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.analysis import Analysis
 
-_NOTABLE_MOVE = 1.0  # of a standard error
-_UNLIKELY_MOVE = 4.0  # deviations of the difference of both estimates
 _MIN_SAMPLES_PER_PARAMETER = 2  # samples for each parameter, that are left
-_ADVICE = (
-    "Give the input before the record (trim a longer recording, or put rows with an empty output "
-    "before it), or"
-)
 _CONTRADICTION = 3.0  # mean square of samples that read assumed input, over that of the others
 _RELEASE = 1e6  # times their range
 _UNLIKELY = 1e-3  # probability of these residuals if the assumption holds
 _MAX_STEPS = 30  # of least squares, with as many simulations as there are parameters and one
 
 
-def warn_unrecorded_input(
+def find_unrecorded_input(
     problem: Problem, analysis: Analysis, *, is_contradicted: bool
-) -> list[str]:
-    """Warn about samples that read an assumed input, if they matter.
+) -> Iterator[Finding]:
+    """Find an assumed input before the record that the data contradict.
 
-    They do if estimates change without them, or if the data contradict what is assumed
-    (`is_contradicted`, by `compare_where_recorded`).
+    `is_contradicted` is that of `compare_where_recorded`.
     """
+    if not is_contradicted:
+        return
     parts = find_assumed_samples(problem, analysis)
-    assumed = np.concatenate(parts)[problem.scored_rows]
-    moves = _find_moves(problem, analysis, assumed)
-    if not (moves or is_contradicted):
-        return []
-    count = int(np.count_nonzero(assumed))
-    subject, pronoun = (
-        ("one sample reads", "it") if count == 1 else (f"{count} samples read", "them")
+    most = max(int(np.count_nonzero(part)) for part in parts)
+    yield Finding(
+        "input before the record",
+        "history",
+        "note",
+        "the input moved before the record",
+        "samples at the start of the record read an input from before it, which was not recorded. "
+        "Its first value is assumed there, and the data contradict it.",
+        "Give the input before the record (trim a longer recording, or put rows with an empty "
+        f"output before it), or use skip: {most}.",
     )
-    doubt = ", and the data contradict it" if is_contradicted else ""
-    without = f" Without {pronoun} {', '.join(moves)}." if moves else ""
-    return [
-        f"{subject} an input from before the record, which was not recorded. Its first value is "
-        f"assumed there{doubt}.{without} {_ADVICE} skip: "
-        f"{max(int(np.count_nonzero(part)) for part in parts)}"
-    ]
-
-
-def _find_moves(problem: Problem, analysis: Analysis, assumed: BoolArray) -> list[str]:
-    """Find the estimates that move without the assumed samples (n,), and describe the moves."""
-    if (
-        analysis.residuals_and_sensitivities is None
-        or analysis.is_whitened
-        or analysis.linear_model is None
-        or problem.prediction != "simulation"
-    ):
-        return []  # not of plain squares
-    if analysis.is_cut_short:
-        return []  # the time is over
-    if not all(isinstance(initial, EstimatedInitial) for initial in problem.model.initial):
-        return []  # a fixed start carries the effect of the assumption into the other samples
-    left = np.count_nonzero(~assumed)
-    if not assumed.any() or left <= _MIN_SAMPLES_PER_PARAMETER * len(problem.free_parameters):
-        return []
-    if not _would_move(problem, analysis, assumed):
-        return []
-    return _describe_moves(problem, analysis, _refit_without_assumed(problem, analysis))
 
 
 def find_assumed_samples(problem: Problem, analysis: Analysis) -> list[BoolArray]:
     """Mark the samples of every output that read an input from before its recorded part."""
-    reach = _compute_longest_input_delay(
-        problem, {one.name: (one.value, one.value) for one in analysis.estimates}
-    )
+    reach = compute_reach(problem, analysis)
     return [
         channel.times < until
         for record, until in zip(
@@ -123,6 +90,12 @@ def _find_recorded_starts(problem: Problem, reach: float) -> list[float]:
     ]
 
 
+def compute_reach(problem: Problem, analysis: Analysis) -> float:
+    """Compute how far (s) the time lags of inputs reach back at the estimate."""
+    spans = {one.name: (one.value, one.value) for one in analysis.estimates}
+    return _compute_longest_input_delay(problem, spans)
+
+
 def _compute_longest_input_delay(problem: Problem, spans: Mapping[str, Interval]) -> float:
     """Compute how far (s) the time lags of inputs reach back at most, inside these bounds."""
     if not list_delayed_values(problem.model, "input"):
@@ -133,53 +106,6 @@ def _compute_longest_input_delay(problem: Problem, spans: Mapping[str, Interval]
         for past in list_past_values(problem.model)
         if past.kind == "input"
     )
-
-
-def _would_move(problem: Problem, analysis: Analysis, assumed: BoolArray) -> bool:
-    """Whether a step without these samples moves an estimate by far more than chance."""
-    if analysis.residuals_and_sensitivities is None:
-        return False
-    error, columns = analysis.residuals_and_sensitivities
-    recorded = columns[~assumed]
-    move = -np.linalg.lstsq(recorded, error[~assumed], rcond=RANK_TOLERANCE)[0]
-    by_all, by_recorded = compute_variances(columns), compute_variances(recorded)
-    scale = compute_physical_scale(problem, _to_theta(problem, analysis))
-    for d, estimate in enumerate(_select_identified(problem, analysis)):
-        if estimate is None or not estimate.stderr or not 0.0 < by_all[d] < np.inf:
-            continue
-        chance = np.sqrt(max(by_recorded[d] / by_all[d] - 1.0, 0.0))
-        if abs(move[d] * scale[d]) / estimate.stderr > max(_NOTABLE_MOVE, _UNLIKELY_MOVE * chance):
-            return True
-    return False
-
-
-def _select_identified(problem: Problem, analysis: Analysis) -> list[Estimate | None]:
-    """List the identified estimates in the order of the free parameters (D,); None for others."""
-    names = {estimate.name for estimate in problem.model.parameters}
-    by_name = {
-        estimate.name: estimate
-        for estimate in analysis.estimates
-        if estimate.status == "identified"
-    }
-    return [by_name.get(name) if name in names else None for name in problem.free_names]
-
-
-def _to_theta(problem: Problem, analysis: Analysis) -> FloatArray:
-    by_name = {estimate.name: estimate.value for estimate in analysis.estimates}
-    return np.array([by_name[name] for name in problem.free_names])
-
-
-def _refit_without_assumed(problem: Problem, analysis: Analysis) -> FloatArray:
-    """Fit the other samples, from the estimate (D,) on; return the estimate if that fails."""
-    theta = _to_theta(problem, analysis)
-    reach = _compute_longest_input_delay(
-        problem, {one.name: (one.value, one.value) for one in analysis.estimates}
-    )
-    others = _select_recorded(problem, reach)
-    if others is None:
-        return theta
-    (end,) = refine_candidates(others, [theta], _MAX_STEPS * (theta.size + 1))
-    return theta if end is None else end.theta
 
 
 def _select_recorded(
@@ -307,21 +233,6 @@ def _is_contradicted(
         return bool(np.any(error != 0))
     ratio = float(np.mean(error**2)) / variance
     return f_tail(count, degrees, ratio) < _UNLIKELY
-
-
-def _describe_moves(problem: Problem, analysis: Analysis, end: FloatArray) -> list[str]:
-    """Describe estimates that would change, with their moves in standard errors."""
-    moves = []
-    for estimate, value in zip(_select_identified(problem, analysis), end.tolist(), strict=True):
-        if estimate is None or not estimate.stderr:
-            continue
-        shift = abs(value - estimate.value) / estimate.stderr
-        if shift > _NOTABLE_MOVE:
-            moves.append(
-                f"{estimate.name} is {value:.4g} instead of {estimate.value:.4g}, {shift:.2g} of "
-                "its standard errors away"
-            )
-    return moves
 
 
 def compute_variances(columns: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ odds of 20 to 1 (Kass and Raftery 1995: strong evidence). Orders within 6 of the
 and the dead time lies in the range of theirs.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -27,20 +27,22 @@ from sysid.control.linear_form import IdentifiedModel
 from sysid.control.process_form import recognise_process
 from sysid.core.errors import SysidError
 from sysid.core.settings import FitSettings, Loss, StartKind
-from sysid.core.text import plain_estimate, plain_unit
+from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
-from sysid.diagnosis.warnings import find_delay_parameters
+from sysid.judgement.levels import SEPARABLE
+from sysid.judgement.residual_context import find_delay_parameters
 from sysid.models.catalogue.load import load_model
 from sysid.models.catalogue.process_family import Process, ProcessEntry, list_neighbouring_orders
 from sysid.models.model import name_initial_state, replace_substeps
 from sysid.noise_models.first_order_fit import fit_first_order_noise
 from sysid.residuals.series import is_coloured, iterate_parts
+from sysid.results.findings import Finding, Move
 from sysid.results.parts import OrderComparison, OrderFit, compare_fits
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.start_values import starts_at_rest
-from sysid.uncertainty.analysis import Analysis, analyse_estimate, compute_criteria
+from sysid.uncertainty.analysis import analyse_estimate, compute_criteria
 from sysid.uncertainty.estimates import Estimate
 
 _SUBSTEPS = 4  # of every order: a fast part needs them, and one step for all compares them fairly
@@ -48,7 +50,6 @@ _NEGLIGIBLE_SHARE = 1e-3  # of the output: smaller residuals are of the integrat
 _NEW_PARTS = (0.1, 0.4, 1.0)  # of the slowest time constant: starts of the part that is added
 _MOVE = 1e-3  # of a parameter, relative: what it changes in the process
 _MAX_SIMULATIONS = 4000  # of an order: half for the fit, the rest for noise model and errors
-_NOTABLE_MOVE = 1.0  # of a standard error of the dead time
 
 
 class _Assumptions(NamedTuple):
@@ -135,69 +136,63 @@ def compare_orders(
         assumptions.delay.unit,
         "ar1" if has_colour else "white",
         compared,
+        problem.n_scored,
     )
     if bounded & {own, comparison.preferred_model}:
         return None, spent
     return comparison, spent
 
 
-def mark_order_dependent(
-    analysis: Analysis, comparison: OrderComparison | None
-) -> tuple[Estimate, ...]:
-    """Mark an identified dead time whose interval does not hold that of the preferred order.
+def find_other_orders(
+    comparison: OrderComparison | None, model: str, estimates: Sequence[Estimate]
+) -> Iterator[Finding]:
+    """Find orders that the data prefer, or do not rule out, and that move the dead time.
 
-    Its standard error assumes the model's order, and the data contradict that. If errors are by
-    repeat, nothing is marked: the criterion takes samples as independent, and says too much.
+    Orders that are open move it by more than its interval. `model` is the name of the model that
+    was identified.
     """
-    estimates, uncertainty = analysis.estimates, analysis.uncertainty
-    is_clustered = uncertainty is not None and uncertainty.noise_colour == "clustered"
-    if comparison is None or is_clustered:
-        return estimates
-    if comparison.preferred_model in (None, comparison.model):
-        return estimates
-    [best] = comparison.open_fits
-    reason = f"it is {_write_delay(comparison, best)}, which the data prefer"
-    return tuple(
-        replace(estimate, status="order-dependent", reason=reason)
-        if estimate.name == comparison.delay
-        and estimate.status == "identified"
-        and estimate.interval95 is not None
-        and not estimate.interval95[0] <= best.delay <= estimate.interval95[1]
-        else estimate
-        for estimate in estimates
+    if comparison is None or comparison.preferred_model == comparison.model:
+        return
+    own, name = comparison.own_fit, comparison.delay
+    estimate = next(one for one in estimates if one.name == name)
+    others = [fit for fit in comparison.open_fits if fit.model != own.model]
+    best = min(others, key=lambda fit: fit.bic)
+    moved = [fit for fit in others if _is_moved(fit, own)]
+    if comparison.preferred_model is None and not moved:
+        return
+    listed = ", ".join(_write_delay(comparison, fit) for fit in (own, *others))
+    cure = "Give your model as many time constants, or use" if model != own.model else "Use"
+    if comparison.preferred_model is None:
+        names = join_names([fit.model for fit in comparison.open_fits])
+        brief = f"the data do not tell {names} apart"
+        text, advice = f"{brief}: {name} is {listed}.", ""
+    else:
+        brief = f"the data prefer {best.model}"
+        text = (
+            f"the data prefer {best.model} (order {best.order}) to {own.model} (order "
+            f"{own.order}): its BIC is {own.bic - best.bic:.3g} lower. {name} is {listed}."
+        )
+        cure = "Give your model as many time constants, or use" if model != own.model else "Use"
+        advice = f"{cure} the model {best.model}."
+    yield Finding(
+        "order",
+        "structure",
+        "caution" if moved else "note",
+        brief,
+        text,
+        advice,
+        own.bic - best.bic,
+        tuple(
+            Move(name, fit.delay, fit.delay_stderr, (fit.delay - estimate.value) / estimate.stderr)
+            for fit in sorted(moved, key=lambda fit: fit.bic)
+            if estimate.stderr
+        ),
+        (name,) if moved else (),
     )
 
 
-def warn_other_order(comparison: OrderComparison | None, model: str) -> list[str]:
-    """Warn if the data prefer another order, or if the dead time depends on an open one.
-
-    `model` is the name of the model that was identified.
-    """
-    if comparison is None or comparison.preferred_model == comparison.model:
-        return []
-    own, name = comparison.own_fit, comparison.delay
-    if comparison.preferred_model is None:
-        others = [fit for fit in comparison.open_fits if _has_other_delay(fit, own)]
-        if not others:
-            return []
-        listed = ", ".join(_write_delay(comparison, fit) for fit in others)
-        return [
-            f"{name} depends on the order of the model, which the data do not tell: "
-            f"{_write_delay(comparison, own)}, {listed}. Its standard error "
-            "assumes that the order is right"
-        ]
-    [best] = comparison.open_fits
-    cure = "Give your model as many time constants, or use" if model != own.model else "Use"
-    return [
-        f"the data prefer {best.model} (order {best.order}) to {own.model} (order {own.order}): "
-        f"its BIC is {own.bic - best.bic:.3g} lower. {name} is "
-        f"{_write_delay(comparison, best)}, {_write_delay(comparison, own)}. "
-        f"{cure} the model {best.model}"
-    ]
-
-
-def _has_other_delay(fit: OrderFit, own: OrderFit) -> bool:
-    return abs(fit.delay - own.delay) > _NOTABLE_MOVE * (own.delay_stderr or 0.0)
+def _is_moved(fit: OrderFit, own: OrderFit) -> bool:
+    return abs(fit.delay - own.delay) > SEPARABLE * (own.delay_stderr or 0.0)
 
 
 def _write_delay(comparison: OrderComparison, fit: OrderFit) -> str:

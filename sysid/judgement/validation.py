@@ -1,6 +1,6 @@
 """Validation of estimates on data that were not used for them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
@@ -11,6 +11,7 @@ from sysid.core.errors import InvalidRecord
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.residuals.residual_tests import ResidualTests, run_residual_tests
+from sysid.results.findings import Finding, note
 from sysid.search.refine import refine_candidates
 from sysid.simulation.fit_metrics import Metrics
 from sysid.simulation.problem import Problem, compute_metrics
@@ -18,6 +19,7 @@ from sysid.uncertainty.estimates import Estimate
 
 _STILL_SHARE = 0.3  # of the estimation data's variation: validation data with less hardly move
 _STILL_NOISE = 2.0  # of the estimation RMS: and with less they show mostly noise
+_NOTABLE_LOSS = 20.0  # percentage points of fit, from estimation to validation
 _START_SHARE = 0.3  # of a validation record: its first part gives its initial states
 
 
@@ -132,47 +134,48 @@ def _leave_out_fit(metrics: Metrics) -> Metrics:
     return replace(metrics, fit_percent=float("nan"), channels=channels)
 
 
-def warn_still_validation(
-    problem: Problem, metrics: Metrics, validated: Validation | None
-) -> list[str]:
-    """Warn about validation data that hardly move: their fit % would say nothing."""
-    if validated is None or not validated.is_still:
-        return []
-    unit = format_unit(metrics.unit)
-    return [
-        f"the validation data hardly move: their standard deviation is {validated.spread:.3g}{unit}"
-        f", that of the estimation data {problem.output_scale:.3g}{unit}. So their fit % says "
-        f"nothing. Compare the RMS: {validated.metrics.rms:.3g}{unit} in validation, "
-        f"{metrics.rms:.3g}{unit} in estimation."
-    ]
-
-
-def mark_refuted(
-    estimates: tuple[Estimate, ...], validated: Validation | None
-) -> tuple[Estimate, ...]:
-    """Mark the identified estimates of a model that does not predict its validation data."""
-    if validated is None or not validated.is_refuted:
-        return estimates
-    reason = "the model predicts the validation data worse than their mean"
-    return tuple(
-        replace(estimate, status="not validated", reason=reason)
-        if estimate.status == "identified"
-        else estimate
-        for estimate in estimates
-    )
-
-
-def warn_refuted(metrics: Metrics, validated: Validation | None) -> list[str]:
-    """Warn about a model that predicts its validation data worse than their mean."""
-    if validated is None or not validated.is_refuted:
-        return []
-    unit = format_unit(metrics.unit)
-    return [
-        "the model predicts the validation data worse than their mean: RMS "
-        f"{validated.metrics.rms:.3g}{unit} against {validated.spread:.3g}{unit}, and "
-        f"{metrics.rms:.3g}{unit} in estimation. Do not rely on it. Dynamics or a disturbance are "
-        "missing from the model, or the estimation data do not determine what validation needs."
-    ]
+def find_contradictions(
+    problem: Problem,
+    metrics: Metrics,
+    validated: Validation | None,
+    estimates: Sequence[Estimate],
+) -> Iterator[Finding]:
+    """Find validation data that contradict the model, or that say nothing of it."""
+    if validated is None:
+        return
+    unit, other = format_unit(metrics.unit), validated.metrics
+    if validated.is_still:
+        yield note(
+            "still validation data",
+            "validation",
+            f"the validation data hardly move: their standard deviation is {validated.spread:.3g}"
+            f"{unit}, that of the estimation data {problem.output_scale:.3g}{unit}. So their fit % "
+            f"says nothing. Compare the RMS: {other.rms:.3g}{unit} in validation, "
+            f"{metrics.rms:.3g}{unit} in estimation.",
+        )
+    elif validated.is_refuted:
+        yield Finding(
+            "validation",
+            "validation",
+            "serious",
+            "the validation data contradict the model",
+            "the model predicts the validation data worse than their mean: RMS "
+            f"{other.rms:.3g}{unit} against {validated.spread:.3g}{unit}, and {metrics.rms:.3g}"
+            f"{unit} in estimation. Dynamics or a disturbance are missing from the model, or the "
+            "estimation data do not determine what validation needs.",
+            parameters=tuple(one.name for one in estimates if one.is_free),
+            status="refuted",
+            reason="the model predicts the validation data worse than their mean",
+        )
+    elif metrics.fit_percent - other.fit_percent > _NOTABLE_LOSS:
+        yield Finding(
+            "validation",
+            "validation",
+            "caution",
+            "it fits the validation data worse",
+            f"the fit is {metrics.fit_percent:.1f} % in estimation, and {other.fit_percent:.1f} % "
+            "in validation. The model does not hold for both.",
+        )
 
 
 def _to_fixed_parameter(estimate: Estimate) -> dict[str, float | str]:

@@ -9,8 +9,8 @@ import pytest
 from sysid.core.settings import GeneticAlgorithm
 from sysid.data.derivations import derive_recording
 from sysid.data.records import Channel, Recording
-from sysid.diagnosis.unrecorded_input import find_assumed_samples, warn_unrecorded_input
 from sysid.identification.identify import identify
+from sysid.judgement.unrecorded_input import find_assumed_samples, warn_unrecorded_input
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import FixedInitial, Model
 from sysid.search.refine import refine_candidates

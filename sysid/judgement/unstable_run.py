@@ -12,25 +12,25 @@ or if its residuals are white. A free run counts as unstable if the effect of so
 times as large in the last quarter of an experiment as in its first half. A double integrator
 reaches three.
 
-A value is `prediction-dependent` if its 95 % interval does not hold that of one step ahead. Such an
+A value depends on that if its 95 % interval does not hold that of one step ahead. Such an
 interval is often far too narrow: disturbances grow, and so do the sensitivities.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
-from sysid.diagnosis.fixed_start import compute_start_slopes, list_fixed_starts
-from sysid.diagnosis.input_hold import replace_holds, write_hold
-from sysid.diagnosis.warnings import find_delay_parameters
+from sysid.judgement.fixed_start import compute_start_slopes, list_fixed_starts
+from sysid.judgement.input_hold import replace_holds, write_hold
+from sysid.judgement.residual_context import find_delay_parameters
 from sysid.minima.minima import scan_parameters
 from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.series import is_coloured, iterate_parts
+from sysid.results.findings import Finding, Move
 from sysid.results.parts import InputHold
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
@@ -100,41 +100,37 @@ def compare_one_step(
     return OneStepComparison(cause, predicted.estimates, options), spent
 
 
-def mark_prediction_dependent(
-    estimates: tuple[Estimate, ...], comparison: OneStepComparison | None
-) -> tuple[Estimate, ...]:
-    """Mark identified values that the estimates of one step ahead contradict."""
-    ahead = {one.name: one for one in comparison.estimates} if comparison else {}
-    return tuple(
-        replace(
-            estimate,
-            status="prediction-dependent",
-            reason=f"it is {_write_value(ahead[estimate.name])} predicted one step ahead",
-        )
-        if estimate.name in ahead
-        and estimate.status in ("identified", "hold-dependent")
-        and estimate.interval95 is not None
-        and not estimate.interval95[0] <= ahead[estimate.name].value <= estimate.interval95[1]
-        else estimate
-        for estimate in estimates
-    )
-
-
-def _write_value(estimate: Estimate) -> str:
-    return f"{plain_estimate(estimate.value, estimate.stderr)}{plain_unit(estimate.unit)}"
-
-
-def warn_misled_run(
+def find_misled_run(
     estimates: Sequence[Estimate], comparison: OneStepComparison | None
-) -> list[str]:
-    """Warn about a free run that disturbances mislead, with estimates of one step ahead."""
+) -> Iterator[Finding]:
+    """Find a free run that disturbances mislead, with the estimates of one step ahead."""
     if comparison is None:
-        return []
-    described = _describe(comparison.estimates, {one.name: one for one in estimates})
-    return [
-        f"{comparison.cause}. So a free run attributes disturbances to the parameters. Predicted "
-        f"one step ahead they are {described}. Use {' and '.join(comparison.options)}."
+        return
+    ahead = {one.name: one for one in comparison.estimates}
+    moves = [
+        Move(one.name, other.value, other.stderr, (other.value - one.value) / one.stderr)
+        for one in estimates
+        if (other := ahead.get(one.name)) is not None and one.stderr and one.is_free
     ]
+    known = {one.name: one.interval95 for one in estimates}
+    outside = [
+        move.parameter
+        for move in moves
+        if (interval := known[move.parameter]) is not None
+        and not interval[0] <= move.value <= interval[1]
+    ]
+    described = _describe(comparison.estimates, {one.name: one for one in estimates})
+    yield Finding(
+        "noise in the plant",
+        "noise",
+        "serious" if outside else "note",
+        "disturbances mislead the free run",
+        f"{comparison.cause}. So a free run attributes disturbances to the parameters. Predicted "
+        f"one step ahead they are {described}.",
+        f"Use {' and '.join(comparison.options)}.",
+        moves=tuple(sorted(moves, key=lambda move: -abs(move.stderrs))),
+        parameters=tuple(outside),
+    )
 
 
 def _may_mislead(problem: Problem, analysis: Analysis) -> bool:

@@ -9,8 +9,8 @@ from scipy.signal import lfilter
 from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.data.noise import Noise, add_output_noise
 from sysid.data.records import Channel, Record
-from sysid.diagnosis.fixed_start import warn_fixed_starts
 from sysid.identification.identify import identify
+from sysid.judgement.fixed_start import warn_fixed_starts
 from sysid.models.model import FixedInitial, MeasuredInitial, Model
 from sysid.models.parse import parse_model
 from sysid.search.refine import refine_candidates

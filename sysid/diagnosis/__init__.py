@@ -1,1 +1,0 @@
-"""What speaks against an estimate: start, past, hold, step, order, suspects, validation."""

@@ -1,0 +1,103 @@
+"""Agreement with the data: whether the model explains them at all."""
+
+from collections.abc import Iterator, Sequence
+from math import isfinite
+
+import numpy as np
+
+from sysid.core.text import join_names
+from sysid.core.units import format_unit
+from sysid.results.findings import Finding
+from sysid.simulation.fit_metrics import ChannelMetrics, Metrics
+from sysid.simulation.problem import Problem
+
+_LITTLE = 30.0  # %: a smaller fit beside residuals that are not noise is a failure
+
+
+def find_disagreement(
+    metrics: Metrics, limit: float | None, *, are_residuals_noise: bool
+) -> Iterator[Finding]:
+    """Find a model that fails: above the safe limit, or worse than a constant or a line."""
+    if limit is not None and metrics.rms > limit:
+        yield Finding(
+            "safe limit",
+            "structure",
+            "serious",
+            "the model is invalid",
+            f"the RMS error {metrics.rms:.4g} is above the safe limit {limit:g}, so the model is "
+            "not valid.",
+        )
+    fit = metrics.fit_percent
+    if isfinite(fit) and fit <= 0:
+        yield Finding(
+            "constant",
+            "structure",
+            "serious",
+            "the model does not explain the output",
+            f"the fit is {fit:.1f} %: a constant fits {'better' if fit < 0 else 'as well'}.",
+            "Choose another model, or look at channels and bounds.",
+        )
+    elif isfinite(fit) and fit < _LITTLE and not are_residuals_noise:
+        yield Finding(
+            "little fit",
+            "structure",
+            "serious",
+            "the model explains little of the output",
+            f"the fit is {fit:.1f} %, and what is left is not noise.",
+            "Choose another model, or look at channels and bounds.",
+        )
+    yield from _find_straight_lines(metrics.channels)
+
+
+def find_constant_outputs(problem: Problem) -> Iterator[Finding]:
+    """Find outputs whose scored samples are all equal, in every experiment."""
+    measured = problem.split_by_output(problem.evaluator.measured)
+    weights = problem.split_by_output(problem.evaluator.weight)
+    still = []
+    for output in problem.model.outputs:
+        values = np.concatenate(
+            [y[output.name][w[output.name] > 0] for y, w in zip(measured, weights, strict=True)]
+        )
+        if np.ptp(values) == 0.0:
+            still.append((output.name, values, format_unit(output.unit)))
+    for name, values, unit in still:
+        severity = "serious" if len(still) == len(problem.model.outputs) else "caution"
+        yield Finding(
+            "constant output",
+            "record",
+            severity,
+            "the output is constant" if severity == "serious" else f"{name} is constant",
+            f"output {name!r} is constant ({values[0]:.4g}{unit}) at all {values.size} samples: it "
+            "contains no dynamics, and the fit % is undefined.",
+            "Choose another channel, or a record in which it moves.",
+        )
+
+
+def _find_straight_lines(channels: Sequence[ChannelMetrics]) -> Iterator[Finding]:
+    """Find outputs that a straight line explains better, over all experiments or in one."""
+    outputs = dict.fromkeys(one.output for one in channels if one.is_worse_than_line)
+    failed = [name for name in outputs if _is_worse_than_line(channels, name)]
+    has_several = any(channel.experiment for channel in channels)
+    for channel in channels:
+        if not channel.is_worse_than_line:
+            continue
+        where = f" of experiment {channel.experiment + 1}" if has_several else ""
+        yield Finding(
+            "straight line",
+            "structure",
+            "serious" if channel.output in failed else "caution",
+            f"a straight line explains {join_names(failed)} better"
+            if failed
+            else f"a straight line explains a part of {join_names(list(outputs))} better",
+            f"the model fits {channel.output}{where} worse than a straight line (RMS "
+            f"{channel.rms:.4g} against {channel.line_rms:.4g}{format_unit(channel.unit)}).",
+            "Choose another model, or look at channels, bounds, and a change during the recording."
+            if failed
+            else "These records tell little of the model, or it does not hold there.",
+        )
+
+
+def _is_worse_than_line(channels: Sequence[ChannelMetrics], output: str) -> bool:
+    """Whether straight lines fit an output better than the model, over all experiments."""
+    own = [one for one in channels if one.output == output and isfinite(one.line_rms)]
+    return sum(one.samples * (one.rms**2 - one.line_rms**2) for one in own) > 0

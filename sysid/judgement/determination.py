@@ -1,0 +1,205 @@
+"""Determination: what the data do not tell of single parameters, and bounds that hold them."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from sysid.core.text import join_names
+from sysid.core.units import format_unit
+from sysid.identifiability.combinations import IdentifiableCombination
+from sysid.judgement.levels import SEPARABLE
+from sysid.results.findings import Finding, note
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import Analysis
+from sysid.uncertainty.estimates import Estimate, Uncertainty
+
+_RIDGE_CORRELATION = 0.9  # of a time lag that is not separable from 0: it shares its effect
+_VAGUE_SHARE = 0.5  # of its value: standard error from which a group is practically unidentifiable
+
+
+def find_undetermined(
+    problem: Problem, analysis: Analysis, delays: set[str], *, are_residuals_noise: bool
+) -> Iterator[Finding]:
+    """Find what the data do not determine: alone, in combination, or beyond a bound."""
+    free = [one for one in analysis.estimates if one.is_free]
+    yield from _find_bounds(analysis, free, delays, are_residuals_noise=are_residuals_noise)
+    yield from _find_unidentifiable(free)
+    yield from _find_constant_inputs(problem, free)
+    if analysis.uncertainty is not None:
+        yield from _find_insignificant(free, delays)
+        yield from _find_vague_groups(analysis.uncertainty.groups)
+        yield from _find_inseparable(analysis.uncertainty, free, delays)
+
+
+def find_ambiguous(estimates: Sequence[Estimate]) -> Iterator[Finding]:
+    """Find values of other minima that fit as well."""
+    found = [one for one in estimates if one.status == "ambiguous"]
+    if found:
+        names = join_names([one.name for one in found])
+        values = "; ".join(f"{one.name}: {one.reason}" for one in found)
+        yield Finding(
+            "other minimum",
+            "search",
+            "caution",
+            f"another value of {names} fits as well",
+            f"another minimum fits as well, with other values of {names} ({values}).",
+            "Use an input that tells them apart, or narrower bounds.",
+            parameters=tuple(one.name for one in found),
+            status="ambiguous",
+        )
+
+
+def _find_bounds(
+    analysis: Analysis,
+    free: Sequence[Estimate],
+    delays: set[str],
+    *,
+    are_residuals_noise: bool,
+) -> Iterator[Finding]:
+    """Find estimates at a bound; with residuals that are not noise they are no physical limit."""
+    bounded = [one for one in free if one.status == "at bound"]
+    if not bounded and not analysis.active_bounds:
+        return
+    active = analysis.active_bounds
+    names = [one.name for one in bounded] or [bound.name for bound in active]
+    lies = "lies at its bound" if len(names) == 1 else "lie at their bounds"
+    texts = [str(bound) for bound in active]
+    listed = {bound.name for bound in active}
+    texts += [_describe_bound(one) for one in bounded if one.name not in listed]
+    cures = join_names([bound.advice for bound in active]) if active else ""
+    is_serious = bool(active) and not are_residuals_noise
+    cause = " The residuals are not noise, which the bound may cause." if is_serious else ""
+    yield Finding(
+        "bound",
+        "identifiability",
+        "serious" if is_serious else "caution",
+        f"{join_names(names)} {lies}",
+        f"{join_names(texts)}. The best value may be outside, and other estimates follow it."
+        f"{cause}",
+        f"To widen: {cures}, unless it is a physical limit."
+        if cures
+        else "Widen the range, unless it is a physical limit.",
+        parameters=tuple(names),
+        status="at bound",
+    )
+
+
+def _describe_bound(estimate: Estimate) -> str:
+    is_low = estimate.value < 0.5 * (estimate.lower + estimate.upper)
+    side, bound = ("lower", estimate.lower) if is_low else ("upper", estimate.upper)
+    return f"{estimate.name} lies at its {side} bound {bound:g}{format_unit(estimate.unit)}"
+
+
+def _find_unidentifiable(free: Sequence[Estimate]) -> Iterator[Finding]:
+    alone = [one for one in free if one.status == "unidentifiable"]
+    if alone:
+        names = [one.name for one in alone]
+        reasons = dict.fromkeys(f"{one.name}: {one.reason}" for one in alone)
+        yield Finding(
+            "no information",
+            "identifiability",
+            "caution",
+            f"the data do not determine {join_names(names)}",
+            f"the data do not determine {join_names(names)} ({'; '.join(reasons)}).",
+            f"Fix {'it' if len(names) == 1 else 'them'}, or excite the system differently.",
+            parameters=tuple(names),
+            status="unidentifiable",
+        )
+    grouped = [one for one in free if one.status == "group"]
+    if grouped:
+        names = [one.name for one in grouped]
+        reasons = dict.fromkeys(one.reason for one in grouped if one.reason)
+        yield Finding(
+            "combination",
+            "identifiability",
+            "caution",
+            f"the data determine {join_names(names)} only in combination",
+            f"the data do not determine {join_names(names)} alone, only in combination"
+            f"{f': {chr(59).join(reasons)}' if reasons else ''}.",
+            "Use the combinations, or fix a parameter that you know.",
+            parameters=tuple(names),
+            status="group",
+        )
+
+
+def _find_constant_inputs(problem: Problem, free: Sequence[Estimate]) -> Iterator[Finding]:
+    """Find inputs that are constant in every record, and the parameters that they leave open."""
+    unknown = [one.name for one in free if one.status in ("group", "unidentifiable")]
+    for quantity in problem.model.inputs:
+        values = [
+            channel.values
+            for record in problem.records
+            for channel in record.inputs
+            if channel.name == quantity.name
+        ]
+        if unknown and all(float(np.ptp(signal)) == 0.0 for signal in values):
+            yield Finding(
+                "constant input",
+                "record",
+                "caution",
+                f"{quantity.name} is constant",
+                f"input {quantity.name!r} is constant, so it excites nothing. These data leave "
+                f"unidentified: {', '.join(unknown)}.",
+                "Choose another channel, or a record in which it moves.",
+            )
+
+
+def _find_insignificant(free: Sequence[Estimate], delays: set[str]) -> Iterator[Finding]:
+    """Find quantities that cannot be negative and are not distinguishable from 0."""
+    for one in free:
+        if one.status != "identified" or not one.stderr or one.lower < 0:
+            continue
+        unit = format_unit(one.unit)
+        if one.name in delays and abs(one.value) < SEPARABLE * one.stderr:
+            yield Finding(
+                "no time lag",
+                "identifiability",
+                "caution",
+                f"{one.name} may be 0",
+                f"{one.name} = {one.value:.3g} ± {one.stderr:.3g}{unit} is less than two of its "
+                "standard errors from 0: the data show no time lag.",
+            )
+        elif one.stderr >= one.value:
+            yield note(
+                "insignificant",
+                "identifiability",
+                f"the standard error of {one.name}, {one.stderr:.3g}{unit}, is as large as its "
+                f"value, {one.value:.3g}{unit}",
+            )
+
+
+def _find_vague_groups(groups: Sequence[IdentifiableCombination]) -> Iterator[Finding]:
+    for group in groups:
+        if group.stderr and group.stderr >= _VAGUE_SHARE * abs(group.value):
+            yield note(
+                "vague combination",
+                "identifiability",
+                f"{group.text} is practically unidentifiable: {group.value:.3g} with a standard "
+                f"error of {group.stderr:.3g}",
+            )
+
+
+def _find_inseparable(
+    uncertainty: Uncertainty, free: Sequence[Estimate], delays: set[str]
+) -> Iterator[Finding]:
+    """Find time lags not distinguishable from 0 that share their effect with a parameter."""
+    known = {one.name: one for one in free if one.stderr}
+    small = {
+        name
+        for name in delays
+        if name in known and abs(known[name].value) < SEPARABLE * (known[name].stderr or 0.0)
+    }
+    names = uncertainty.names
+    for i, first in enumerate(names):
+        for j, second in enumerate(names[i + 1 :], i + 1):
+            if not {first, second} & small or not {first, second} <= known.keys():
+                continue
+            r = float(uncertainty.correlation[i, j])
+            alike = float(uncertainty.sensitivity_correlation[i, j])
+            if max(abs(r), abs(alike)) > _RIDGE_CORRELATION:
+                yield note(
+                    "ridge",
+                    "identifiability",
+                    f"{first} and {second} are not separable (correlation {r:.3f}): the data fix "
+                    "only a combination of them",
+                )

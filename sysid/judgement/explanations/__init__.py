@@ -1,0 +1,1 @@
+"""Explanations of what an estimate leaves of the data, a file for each family."""

@@ -1,0 +1,117 @@
+"""Constancy: a parameter or a clock that changes during the record.
+
+Columns S·1(t > τ) and S·t beside S (Nyblom, J. Am. Stat. Assoc. 84 (1989) 223; Andrews,
+Econometrica 61 (1993) 821; Chow 1960). A clock that drifts moves the output along its own slope:
+dŷ/dt·t and dŷ/dt·1(t > τ). Of one time lag that acts on all inputs no record tells the two apart.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from sysid.core.types import FloatArray
+from sysid.judgement.residual_context import Candidate, ResidualContext
+from sysid.judgement.residual_model import ColumnFit
+from sysid.uncertainty.analysis import compute_physical_scale
+
+_SAME_COLUMN = 0.99  # correlation: a lag and a clock that move the output alike
+
+
+def propose(context: ResidualContext) -> Iterator[Candidate]:
+    """Propose that a parameter, or the offset of the clocks, changes or drifts."""
+    model = context.residual_model
+    scale = compute_physical_scale(context.problem, context.theta)
+    share = _centre_times(context)
+    clock = context.weigh(context.slope)[:, 0]
+    is_lag_a_clock = False
+    for number, name in context.declared:
+        column = model.columns[:, number]
+        if not column.any():
+            continue
+        is_lag = name in context.delays
+        is_clock = is_lag and _are_alike(column, clock)
+        is_lag_a_clock |= is_clock
+        subject = f"{name}, or the offset between the clocks," if is_clock else name
+        explanation = "change of a time lag" if is_lag else "change of a parameter"
+        for _, late, moment in context.find_breaks(column):
+            yield Candidate(
+                explanation,
+                "constancy",
+                late[:, None],
+                f"{name} changes at about {moment}",
+                f"{subject} changes at about {moment}",
+                "Identify both parts by themselves: give each a label in a column for --segments.",
+                counted=1,
+                describe=_describe_change(context, number, float(scale[number])),
+            )
+        explanation = "drift of a time lag" if is_lag else "drift of a parameter"
+        yield Candidate(
+            explanation,
+            "constancy",
+            (column * share)[:, None],
+            f"{name} drifts",
+            f"{subject} drifts over the record",
+            describe=_describe_drift(context, number, float(scale[number])),
+        )
+    if not is_lag_a_clock:
+        for _, late, moment in context.find_breaks(clock):
+            yield Candidate(
+                "jump of a clock",
+                "clocks",
+                late[:, None],
+                f"the clocks jump at about {moment}",
+                f"the offset between the clocks of input and output jumps at about {moment}, or "
+                "rows are missing",
+                "Look for lost rows there, and identify both parts by themselves.",
+                counted=1,
+            )
+        yield Candidate(
+            "drift of a clock",
+            "clocks",
+            (clock * share)[:, None],
+            "the clocks drift apart",
+            "the clocks of input and output drift apart",
+            "Put both channels on one clock.",
+        )
+
+
+def _centre_times(context: ResidualContext) -> FloatArray:
+    """Compute the times (n,) from -0.5 to 0.5 over all experiments."""
+    times = context.times
+    return np.asarray((times - np.mean(times)) / max(float(np.ptp(times)), 1e-300))
+
+
+def _are_alike(first: FloatArray, second: FloatArray) -> bool:
+    size = float(np.linalg.norm(first) * np.linalg.norm(second))
+    return size > 0 and abs(float(first @ second)) > _SAME_COLUMN * size
+
+
+def _describe_change(context: ResidualContext, number: int, scale: float) -> "_Describe":
+    return _Describe(context, number, scale, "It is about {} before and {} after.", (0.0, 1.0))
+
+
+def _describe_drift(context: ResidualContext, number: int, scale: float) -> "_Describe":
+    return _Describe(context, number, scale, "It goes from about {} to {}.", (-0.5, 0.5))
+
+
+class _Describe:
+    """Describes two values of a parameter by the coefficient of its column."""
+
+    def __init__(
+        self,
+        context: ResidualContext,
+        number: int,
+        scale: float,
+        text: str,
+        shares: tuple[float, float],
+    ) -> None:
+        self._value, self._number, self._scale = float(context.theta[number]), number, scale
+        self._unit = context.problem.free_parameters[number].unit
+        self._text, self._shares = text, shares
+
+    def __call__(self, fit: ColumnFit) -> str:
+        middle = self._value + float(fit.coefficients[self._number]) * self._scale
+        move = float(fit.coefficients[-1]) * self._scale
+        unit = "" if self._unit == "1" else f" {self._unit}"
+        first, second = (f"{middle + share * move:.4g}{unit}" for share in self._shares)
+        return self._text.format(first, second)

@@ -1,0 +1,90 @@
+"""History: the input before the record, and the states at its start.
+
+Before its first sample an input is assumed to be at its first value. What it was instead acts on
+the samples that read it: a column for each of some spans before the record, of one simulation each.
+States that start at a number or at a measured value have the slopes of the outputs as columns.
+"""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.core.errors import SysidError
+from sysid.data.records import Channel, History, Record
+from sysid.judgement.fixed_start import compute_start_slopes, list_fixed_starts
+from sysid.judgement.residual_context import Candidate, ResidualContext
+from sysid.judgement.unrecorded_input import compute_reach
+
+_SPANS = 4  # of the time that lags reach back before the record
+_MOST_STATES = 8
+
+
+def propose(context: ResidualContext) -> Iterator[Candidate]:
+    """Propose another input before the record, and other starts."""
+    problem = context.problem
+    if problem.prediction != "simulation":
+        return
+    yield from _propose_inputs(context)
+    states = list_fixed_starts(problem)
+    if 0 < len(states) <= _MOST_STATES:
+        noise = float(np.sqrt(np.mean(np.square(context.residual_model.residuals))))
+        slopes = [compute_start_slopes(problem, context.theta, name, noise) for name in states]
+        yield Candidate(
+            "start",
+            "start",
+            np.hstack(slopes),
+            "the record does not start as the model says",
+            f"the record does not start where the model says that {', '.join(states)} does",
+            "Use initial: free.",
+        )
+
+
+def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:
+    """Propose that an input was elsewhere before its first sample."""
+    reach = compute_reach(context.problem, context.analysis)
+    for channel in context.moving_inputs if reach > 0 else ():
+        columns = []
+        for span in range(_SPANS):
+            with suppress(SysidError):
+                other = context.simulate(_change_history(context, channel.name, reach, span))
+                columns.append(other - context.simulated)
+        moved = [column for column in columns if np.all(np.isfinite(column)) and column.any()]
+        if moved:
+            yield Candidate(
+                "input before the record",
+                "history",
+                context.weigh(np.column_stack(moved)),
+                f"{channel.name} moved before the record",
+                f"{channel.name} was not at its first value before the record, as is assumed",
+                "Begin the record earlier, or leave its first samples out with skip.",
+            )
+
+
+def _change_history(context: ResidualContext, name: str, reach: float, span: int) -> list[Record]:
+    """Let an input be elsewhere in one of some spans before each record."""
+    return [
+        replace(
+            record,
+            inputs=tuple(
+                _prepend(channel, reach, span) if channel.name == name else channel
+                for channel in record.inputs
+            ),
+        )
+        for record in context.problem.records
+    ]
+
+
+def _prepend(channel: Channel, reach: float, span: int) -> Channel:
+    known = channel.history
+    first = float(channel.times[0] if known is None else known.times[0])
+    value = float(channel.values[0] if known is None else known.values[0])
+    move = float(np.ptp(channel.values)) or 1.0
+    width = reach / _SPANS
+    begin = first - (span + 1) * width
+    times = np.array([begin - width, begin - 1e-6 * width, begin, begin + width * (1 - 1e-6)])
+    values = np.array([value, value, value + move, value + move])
+    if known is not None:
+        times, values = np.append(times, known.times), np.append(values, known.values)
+    return replace(channel, hold=channel.effective_hold, history=History(times, values))

@@ -1,0 +1,114 @@
+"""Reading: what a sample says of the time between two samples.
+
+An input is held, runs in straight lines, or is the mean of the period that ends or begins with its
+stamp. An output is a value at its stamp, or the mean of such a period. Each is a column ŷ(other
+reading) - ŷ.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.core.errors import SysidError
+from sysid.core.types import FloatArray
+from sysid.judgement.residual_context import Candidate, ResidualContext
+from sysid.kernels.signals.past_reads import is_difference
+
+_FINE = 8  # values in a period of a mean
+
+
+def propose(context: ResidualContext) -> Iterator[Candidate]:
+    """Propose other readings of inputs and outputs."""
+    if is_difference(context.problem.model):
+        return
+    for channel in context.moving_inputs:
+        name = channel.name
+        others = {
+            "held": ("zero", _keep, "is held between its samples"),
+            "as straight lines": ("first", _keep, "runs in straight lines between its samples"),
+            "as means that end at their stamps": (
+                "zero",
+                _shift_back,
+                "is the mean of the period that ends at its stamp",
+            ),
+        }
+        for word, (hold, change, text) in others.items():
+            if change is _keep and hold == channel.effective_hold:
+                continue
+            try:
+                other = context.simulate(context.replace_input(name, change, hold=hold))
+            except SysidError:
+                continue
+            moved = other - context.simulated
+            if np.all(np.isfinite(moved)) and moved.any():
+                setting = f"Use hold: {{{name}: {hold}}}." if change is _keep else ""
+                yield Candidate(
+                    "reading of an input",
+                    "reading",
+                    context.weigh(moved),
+                    f"{name} is better read {word}",
+                    f"the data say that {name} {text}",
+                    setting,
+                )
+    yield from _propose_means(context)
+
+
+def _propose_means(context: ResidualContext) -> Iterator[Candidate]:
+    """Propose that outputs are means of the period after or before their stamps."""
+    for side, word in ((1.0, "begins"), (-1.0, "ends")):
+        try:
+            mean = _simulate_means(context, side)
+        except SysidError:
+            continue
+        if np.all(np.isfinite(mean)):
+            yield Candidate(
+                "mean of a period",
+                "reading",
+                context.weigh(mean - context.simulated),
+                "the output is a mean",
+                f"the output is the mean of the period that {word} at its stamp",
+                "Move the stamps of the output to the middle of the period.",
+            )
+
+
+def _simulate_means(context: ResidualContext, side: float) -> FloatArray:
+    """Simulate the means (n,) of the periods to one side of each scored sample."""
+    problem, records = context.problem, []
+    for record in problem.records:
+        outputs = []
+        for channel in record.outputs:
+            times = _list_fine_times(channel.times, side)
+            inside = (times >= record.start) & (times <= record.stop)
+            distinct = np.unique(times[inside])
+            outputs.append(replace(channel, times=distinct, values=np.zeros(distinct.size)))
+        records.append(replace(record, outputs=tuple(outputs)))
+    fine = problem.rebuild(
+        records=records, weights=problem.output_weights, scored_from=None, skip=0
+    )
+    predicted = fine.split_by_output(fine.predict(context.theta[None])[0])
+    means = np.zeros(context.times.size)
+    for part in context.parts:
+        [channel] = [
+            one for one in fine.records[part.experiment].outputs if one.name == part.output
+        ]
+        values = predicted[part.experiment][part.output]
+        period = float(np.median(np.diff(part.times)))
+        offsets = side * period * (np.arange(_FINE) + 0.5) / _FINE
+        wanted = part.times[:, None] + offsets
+        means[part.rows] = np.mean(np.interp(wanted, channel.times, values), axis=1)
+    return means
+
+
+def _list_fine_times(times: FloatArray, side: float) -> FloatArray:
+    period = float(np.median(np.diff(times)))
+    return np.asarray((times[:, None] + side * period * np.arange(_FINE + 1) / _FINE).ravel())
+
+
+def _keep(values: FloatArray) -> FloatArray:
+    return values
+
+
+def _shift_back(values: FloatArray) -> FloatArray:
+    """Let each value count from the sample before it on."""
+    return np.append(values[1:], values[-1])

@@ -1,0 +1,94 @@
+"""Structure: a part of the response that the model lacks.
+
+One more time constant and a zero are columns of the simulated output itself. What no part of them
+explains, past values of the inputs explain: a model-error model (Ljung, Model validation and model
+error modeling, 1999).
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from sysid.core.types import FloatArray
+from sysid.data.interpolation import interpolate_channel
+from sysid.judgement.residual_context import Candidate, ResidualContext
+
+_PARTS = (1.0, 3.0, 10.0)  # time constants of the new part, in samples
+_LAGS = 12  # past values of each input, denser towards the present, over a quarter of the record
+
+
+def propose(context: ResidualContext) -> Iterator[Candidate]:
+    """Propose one more part, and dynamics of no certain form."""
+    for samples in _PARTS:
+        filtered = np.zeros(context.times.size)
+        for part in context.parts:
+            values = context.simulated[part.rows]
+            filtered[part.rows] = _filter(values, samples) - values
+        yield Candidate(
+            "one more time constant",
+            "structure",
+            context.weigh(filtered),
+            "a time constant is missing",
+            "a time constant is missing from the model",
+            "Use a model of one order more.",
+            counted=1,
+        )
+    yield Candidate(
+        "zero of the response",
+        "structure",
+        context.weigh(np.column_stack([context.slope, _differentiate(context)])),
+        "the beginning of the response is missing",
+        "the response begins otherwise than the model's, as with a zero or an inverse response",
+        "Give the model a lead time: a zero beside its time constants.",
+    )
+    columns = list(_list_past_inputs(context))
+    if columns:
+        yield Candidate(
+            "missing dynamics",
+            "structure",
+            context.weigh(np.column_stack(columns)),
+            "a part of the response is missing",
+            "the residuals follow the inputs: a part of the response is missing from the model",
+            "Try a model of another structure.",
+        )
+        squares = [np.square(column) - np.mean(np.square(column)) for column in columns[::2]]
+        yield Candidate(
+            "missing nonlinearity",
+            "structure",
+            context.weigh(np.column_stack(squares)),
+            "a nonlinear part of the response is missing",
+            "the residuals follow squares of the inputs: the plant is less linear than the model",
+            "Try a nonlinear model.",
+        )
+
+
+def _filter(values: FloatArray, samples: float) -> FloatArray:
+    from scipy.signal import lfilter  # imported late: slow to load
+
+    pole = float(np.exp(-1.0 / samples))
+    return np.asarray(lfilter([1.0 - pole], [1.0, -pole], values - values[0]) + values[0])
+
+
+def _differentiate(context: ResidualContext) -> FloatArray:
+    curvature = np.zeros(context.times.size)
+    for part in context.parts:
+        if part.times.size > 1:
+            curvature[part.rows] = np.gradient(context.slope[part.rows])
+    return curvature
+
+
+def _list_past_inputs(context: ResidualContext) -> Iterator[FloatArray]:
+    """List columns (n,) of past values of each input that moves."""
+    longest = max(part.times.size for part in context.parts)
+    lags = np.unique(np.geomspace(1.0, max(longest / 4, 1.0), _LAGS).astype(np.int64)) - 1
+    for channel in context.moving_inputs:
+        for lag in lags.tolist():
+            column = np.zeros(context.times.size)
+            for part in context.parts:
+                record = context.problem.records[part.experiment]
+                period = float(np.ptp(part.times)) / max(part.times.size - 1, 1)
+                for own in record.inputs:
+                    if own.name == channel.name:
+                        column[part.rows] = interpolate_channel(own, part.times - lag * period)
+            if np.ptp(column) > 0:
+                yield column - np.mean(column)

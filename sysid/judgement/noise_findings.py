@@ -1,0 +1,104 @@
+"""Findings about noise that are no explanation of residuals: its model, feedback, tests."""
+
+from collections.abc import Iterator, Mapping
+
+from sysid.core.text import join_names, plain_unit
+from sysid.core.types import FloatArray
+from sysid.judgement.judge import Explained
+from sysid.judgement.levels import UNLIKELY
+from sysid.residuals.feedback import describe_feedback
+from sysid.residuals.residual_tests import ResidualTests, list_residual_series
+from sysid.results.findings import Finding, note
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import Analysis
+
+
+def find_feedback(problem: Problem, simulated: FloatArray, analysis: Analysis) -> Iterator[Finding]:
+    """Find feedback from outputs to inputs; with white residuals it does no harm."""
+    uncertainty = analysis.uncertainty
+    if uncertainty is not None and uncertainty.noise_colour == "white":
+        return
+    for text in describe_feedback(list_residual_series(problem, simulated)):
+        yield note("feedback", "input", text)
+
+
+def find_noise_model(
+    problem: Problem,
+    correlation_times: Mapping[str, float],
+    squares: FloatArray,
+    *,
+    is_complete: bool,
+    is_chosen: bool,
+) -> Iterator[Finding]:
+    """Find what the noise model does, or why it does nothing.
+
+    `squares` (D,) are the estimates of least squares. `is_chosen`: ``auto`` chose it.
+    """
+    if problem.loss.noise_model != "ar1":
+        return
+    times = [f"{name} {time:.3g} s" for name, time in correlation_times.items() if time > 0]
+    if times:
+        plain = ", ".join(
+            f"{parameter.name} = {value:.4g}{plain_unit(parameter.unit)}"
+            for parameter, value in zip(problem.free_parameters, squares.tolist(), strict=True)
+        )
+        why = " Nothing else explains the residuals." if is_chosen else ""
+        yield note(
+            "coloured noise",
+            "noise",
+            "estimates and standard errors assume first-order noise with a correlation time of "
+            f"{', '.join(times)}.{why} Plain least squares (loss: {{noise_model: white}}) gives "
+            f"{plain}.",
+        )
+    elif is_complete:
+        yield note(
+            "white noise",
+            "noise",
+            "the residuals are consistent with white noise, so the noise model changes nothing",
+        )
+    if not is_complete:
+        yield note(
+            "noise model",
+            "noise",
+            "the noise model was not estimated completely. It needs the method 'improved' with "
+            "refinement, and more simulations than budget and time allowed.",
+        )
+
+
+def find_unexplained(
+    tests: ResidualTests, explained: Explained, analysis: Analysis
+) -> Iterator[Finding]:
+    """Find tests of residuals that fail, and that no explanation was looked for."""
+    failed = [
+        test for test in tests.tests if test.outcome == "failed" and (test.p or 0.0) <= UNLIKELY
+    ]
+    inputs = dict.fromkeys(test.input for test in failed if test.input)
+    if inputs and (tests.data == "validation" or not explained.is_done):
+        names = join_names(list(inputs))
+        yield Finding(
+            "dependence on an input",
+            "structure",
+            "caution",
+            f"the residuals depend on {names}",
+            f"the residuals on the {tests.data} data depend on {names}: a part of the response is "
+            "missing from the model, or it does not hold there.",
+        )
+    elif failed and not explained.is_done:
+        yield Finding(
+            "residuals",
+            "noise",
+            "caution",
+            "the residuals are not noise",
+            f"the residuals on the {tests.data} data are not white, and why was not looked for.",
+            "Identify this record by itself.",
+        )
+    uncertainty = analysis.uncertainty
+    if uncertainty is not None and uncertainty.noise_colour in ("coloured", "drifting"):
+        is_drifting = uncertainty.noise_colour == "drifting"
+        yield note(
+            "coloured noise",
+            "noise",
+            "the residuals drift over the whole record, so the standard errors are too small"
+            if is_drifting
+            else "the noise is coloured, and the standard errors allow for it",
+        )

@@ -1,0 +1,301 @@
+"""What explanations of residuals start from: residuals, sensitivities, and the model itself."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from sysid.core.linear_algebra import compute_truncated_svd
+from sysid.core.types import BoolArray, FloatArray, IntArray
+from sysid.core.units import format_unit
+from sysid.data.records import Channel, Record
+from sysid.judgement.residual_model import ColumnFit, Noise, ResidualModel
+from sysid.kernels.signals.past_reads import list_delayed_values
+from sysid.models.ties import collect_parameter_names
+from sysid.residuals.series import ResidualPart, iterate_parts
+from sysid.results.findings import Family, Move
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import Analysis, compute_physical_scale
+
+_EDGE_SHARE = 0.05  # of an experiment at either end, in which no change is looked for
+_OWN_SHARE = 1e-6  # of a column that no parameter explains: less says nothing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """An explanation of residuals by columns (n, q), in words.
+
+    Attributes
+    ----------
+    explanation, family, brief, text, advice
+        As in `Finding`.
+    columns : FloatArray, shape (n, q)
+        Weighted as the residuals.
+    counted : int
+        Parameters beside the coefficients, such as a position that was chosen.
+    describe : callable or None
+        Completes the text from the coefficients (q,), and from values of the parameters.
+    """
+
+    explanation: str
+    family: Family
+    columns: FloatArray
+    brief: str
+    text: str
+    advice: str = ""
+    counted: int = 0
+    describe: Callable[[ColumnFit], str] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualContext:
+    """Residuals and sensitivities of an estimate by squares, and simulations with other inputs.
+
+    Attributes
+    ----------
+    problem : Problem
+    theta : FloatArray, shape (D,)
+    analysis : Analysis
+        Of squares, not whitened.
+    """
+
+    problem: Problem
+    theta: FloatArray
+    analysis: Analysis
+    spent: list[int] = field(default_factory=list)
+
+    @cached_property
+    def parts(self) -> list[ResidualPart]:
+        """Scored samples of each output of each experiment."""
+        return list(iterate_parts(self.problem))
+
+    @cached_property
+    def weight(self) -> FloatArray:
+        """Weights (n,) of the scored samples."""
+        return self.problem.evaluator.weight[self.problem.scored_rows]
+
+    @cached_property
+    def times(self) -> FloatArray:
+        """Times (n,) of the scored samples, s."""
+        return np.concatenate([part.times for part in self.parts])
+
+    @cached_property
+    def simulated(self) -> FloatArray:
+        """Simulated values (n,) of the scored samples."""
+        return self._predict(self.problem)
+
+    @cached_property
+    def measured(self) -> FloatArray:
+        """Measured values (n,) of the scored samples."""
+        return self.problem.evaluator.measured[self.problem.scored_rows]
+
+    @cached_property
+    def slope(self) -> FloatArray:
+        """Slope (n,) of the simulated values in time."""
+        slope = np.zeros(self.times.size)
+        for part in self.parts:
+            if part.times.size > 1:
+                with np.errstate(all="ignore"):
+                    found = np.gradient(self.simulated[part.rows], part.times)
+                slope[part.rows] = np.where(np.isfinite(found), found, 0.0)
+        return slope
+
+    @cached_property
+    def residual_model(self) -> ResidualModel:
+        """Likelihood of the residuals under columns and coloured noise."""
+        assert self.analysis.residuals_and_sensitivities is not None
+        error, columns = self.analysis.residuals_and_sensitivities
+        return ResidualModel(-error, columns, self.parts)
+
+    @cached_property
+    def declared(self) -> list[tuple[int, str]]:
+        """Numbers and names of the free parameters that the model declares: no initial states."""
+        names = {parameter.name for parameter in self.problem.model.parameters}
+        return [(d, name) for d, name in enumerate(self.problem.free_names) if name in names]
+
+    @cached_property
+    def delays(self) -> set[str]:
+        """Names of the free parameters that time lags depend on."""
+        return find_delay_parameters(self.problem)
+
+    def weigh(self, values: FloatArray) -> FloatArray:
+        """Weight values (n,) or (n, q) of the outputs, as a column or columns (n, q)."""
+        columns = values[:, None] if values.ndim == 1 else values
+        return self.weight[:, None] * columns
+
+    def compute_moves(self, fit: ColumnFit, base: ColumnFit) -> tuple[Move, ...]:
+        """Compute how far a fit moves the parameters from another one, the furthest first."""
+        d = self.theta.size
+        scale = compute_physical_scale(self.problem, self.theta)
+        steps = (fit.coefficients[:d] - base.coefficients[:d]) * scale
+        errors = fit.errors[:d] * scale
+        known = {estimate.name: estimate for estimate in self.analysis.estimates}
+        moves = []
+        for number, name in self.declared:
+            stderr = known[name].stderr
+            if stderr:
+                step = float(steps[number])
+                moves.append(
+                    Move(
+                        name,
+                        float(self.theta[number]) + step,
+                        float(errors[number]),
+                        step / stderr,
+                    )
+                )
+        return tuple(sorted(moves, key=lambda move: -abs(move.stderrs)))
+
+    def simulate(self, records: Sequence[Record]) -> FloatArray:
+        """Simulate the scored values (n,) with other inputs."""
+        return self._predict(
+            self.problem.rebuild(records=records, weights=self.problem.output_weights)
+        )
+
+    def replace_input(
+        self, name: str, change: Callable[[FloatArray], FloatArray], **fields: object
+    ) -> list[Record]:
+        """Replace the values (N,) of an input in all records; other fields of it too."""
+        records = []
+        for record in self.problem.records:
+            inputs = tuple(
+                replace(
+                    channel,
+                    **{
+                        "values": change(channel.values),
+                        "hold": channel.effective_hold,
+                        **fields,
+                    },
+                )
+                if channel.name == name
+                else channel
+                for channel in record.inputs
+            )
+            records.append(replace(record, inputs=inputs))
+        return records
+
+    @cached_property
+    def moving_inputs(self) -> list[Channel]:
+        """Inputs of the model that move, as they are in the first record in which they do."""
+        names = {signal.name for signal in self.problem.model.inputs}
+        found: dict[str, Channel] = {}
+        for record in self.problem.records:
+            for channel in record.inputs:
+                if channel.name in names and np.ptp(channel.values) > 0:
+                    found.setdefault(channel.name, channel)
+        return list(found.values())
+
+    def find_breaks(self, column: FloatArray) -> list[tuple[float, FloatArray, str]]:
+        """Find where a column (n,) most likely begins to count, under white and coloured noise.
+
+        Returns the time (s), the column from there on, and where that is in words. Each moment of
+        each experiment is tried, with the noise of no explanation (sup-F test: Andrews,
+        Econometrica 61 (1993) 821).
+        """
+        model, found = self.residual_model, dict[int, tuple[float, FloatArray, str]]()
+        for noise, basis, residual in self._bases:
+            whitened = (column if noise is None else model.whiten(column, noise))[self._order]
+            ends = self._ends
+            own = _sum_from(np.square(whitened), ends)
+            shared = _sum_from(basis * whitened[:, None], ends)
+            along = _sum_from(residual * whitened, ends)
+            rest = own - np.sum(np.square(shared), axis=1)
+            is_own = self._may_break & (rest > _OWN_SHARE * float(np.max(own, initial=0.0)))
+            score = np.where(is_own, along**2 / np.where(is_own, rest, 1.0), 0.0)
+            best = int(np.argmax(score))
+            if score[best] > 0 and best not in found:
+                late, members = np.zeros(column.size), self._order[best : ends[best]]
+                late[members] = column[members]
+                moment = float(self.times[self._order[best]])
+                found[best] = (moment, late, self._describe_moment(best, moment))
+        return list(found.values())
+
+    def _describe_moment(self, position: int, moment: float) -> str:
+        experiment = int(self._experiments[self._order[position]])
+        where = f" of experiment {experiment + 1}" if len(self.problem.records) > 1 else ""
+        return f"{moment:.4g} s{where}"
+
+    @cached_property
+    def _experiments(self) -> IntArray:
+        numbers = [np.full(part.times.size, part.experiment) for part in self.parts]
+        return np.concatenate(numbers)
+
+    @cached_property
+    def _order(self) -> IntArray:
+        return np.lexsort((self.times, self._experiments))
+
+    @cached_property
+    def _ends(self) -> IntArray:
+        experiments = self._experiments[self._order]
+        return np.searchsorted(experiments, experiments, side="right")
+
+    @cached_property
+    def _may_break(self) -> BoolArray:
+        experiments, times = self._experiments[self._order], self.times[self._order]
+        allowed = np.zeros(times.size, dtype=np.bool_)
+        for number in np.unique(experiments):
+            rows = np.flatnonzero(experiments == number)
+            first = int(_EDGE_SHARE * rows.size) + 1
+            allowed[rows[first : rows.size - first]] = True
+            if number > 0:
+                allowed[rows[0]] = True  # the whole experiment differs
+        return allowed
+
+    @cached_property
+    def _bases(self) -> list[tuple[tuple[Noise, ...] | None, FloatArray, FloatArray]]:
+        """Basis (n, D) of the slopes and residuals (n,), under white and coloured noise."""
+        model, bases = self.residual_model, []
+        base = model.without
+        for noise in (None, base.noise) if base.is_coloured else (None,):
+            columns, residuals = model.columns, model.residuals
+            if noise is not None:
+                columns, residuals = model.whiten(columns, noise), model.whiten(residuals, noise)
+            left, _, _, retained = compute_truncated_svd(columns)
+            basis = left[:, retained]
+            rest = residuals - basis @ (basis.T @ residuals)
+            bases.append((noise, basis[self._order], rest[self._order]))
+        return bases
+
+    def _predict(self, problem: Problem) -> FloatArray:
+        self.spent.append(1)
+        values = problem.predict(self.theta[None])[0][problem.scored_rows]
+        return np.asarray(values)
+
+    def name_part(self, part: ResidualPart) -> str:
+        """Name an output of an experiment."""
+        several = len(self.problem.records) > 1
+        return f"{part.output} of experiment {part.experiment + 1}" if several else part.output
+
+    def iterate_outputs(self) -> Iterator[tuple[str, BoolArray, str]]:
+        """Iterate over the outputs: name, rows (n,), unit."""
+        for output in self.problem.model.outputs:
+            rows = np.zeros(self.times.size, dtype=np.bool_)
+            for part in self.parts:
+                if part.output == output.name:
+                    rows[part.rows] = True
+            if rows.any():
+                yield output.name, rows, format_unit(output.unit)
+
+
+def find_delay_parameters(problem: Problem) -> set[str]:
+    """Find the names of the free parameters that time lags depend on."""
+    names = problem.share("delay parameters", lambda: _collect_delay_parameters(problem))
+    return names & set(problem.free_names)
+
+
+def _collect_delay_parameters(problem: Problem) -> set[str]:
+    past_values = [
+        *list_delayed_values(problem.model, "input"),
+        *list_delayed_values(problem.model, "state"),
+    ]
+    names: set[str] = set()
+    for past_value in past_values:
+        if past_value.delay is not None:
+            names |= collect_parameter_names(past_value.delay)
+    return names
+
+
+def _sum_from(values: FloatArray, ends: IntArray) -> FloatArray:
+    """Sum values (n, …) from each position up to the end of its experiment."""
+    totals = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
+    return np.asarray(totals[ends] - totals[:-1])
