@@ -33,7 +33,7 @@ from sysid.core.errors import InvalidSettings, SysidError
 from sysid.core.settings import InitialSetting, StartKind
 from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
-from sysid.judgement.levels import NOTABLE_MOVE, STRONG_ODDS
+from sysid.judgement.levels import NOTABLE_MOVE, SOLVER_SHARE, STRONG_ODDS
 from sysid.judgement.residual_context import find_delay_parameters
 from sysid.minima.minima import scan_by_projection
 from sysid.models.model import Model
@@ -55,7 +55,6 @@ _MAX_STEPS = 30  # of least squares, with as many simulations as there are param
 _FITS = 4  # of a start: from the estimate, from another start, under a noise model, its errors
 _SCAN, _SEED = 1000, 1  # simulations of a scan for a lower minimum of a start that is not open
 _MOST_TOLD = 3  # moves in a sentence
-_NEGLIGIBLE_SHARE = 1e-3  # of the output: smaller residuals are of the integration, not of noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -236,7 +235,7 @@ def compare_starts(
     known = [(name, one, end) for (name, one), end in zip(named, ends, strict=True) if end]
     if len(known) < 2 or ends[0] is None or is_late():
         return None
-    if min(end.rms for _, _, end in known) <= _NEGLIGIBLE_SHARE * problem.output_scale:
+    if min(end.rms for _, _, end in known) <= SOLVER_SHARE * problem.output_scale:
         return None
     _, largest, end = max(known, key=lambda one: one[2].theta.size)
     has_colour = problem.loss.noise_model == "ar1" or _has_coloured_residuals(largest, end.theta)
