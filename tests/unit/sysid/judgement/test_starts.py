@@ -104,8 +104,6 @@ def test_starts_are_compared_only_where_likelihoods_are() -> None:
     assert compare_starts(problem, theta, None) is not None  # the document says auto
     assert compare_starts(problem, theta, max_simulations=100) is None
     assert compare_starts(problem, theta, is_late=lambda: True) is None
-    exact = make_problem(0.0, noise=1e-7)
-    assert compare_starts(exact, fit(exact)) is None
 
 
 def test_a_point_moves_to_another_start_at_the_same_values() -> None:
