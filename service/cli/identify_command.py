@@ -267,8 +267,13 @@ def check_body(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
         _refuse_model(body["model"], error)
     from service.jobs.record_checks import find_setting_faults
     from sysid.models.model import build_initial_parameters
+    from sysid.models.starts import replace_starts
 
-    parameters = (*model.parameters, *build_initial_parameters(model, pieces))
+    try:
+        started = replace_starts(model, job.initial)
+    except SysidError as error:
+        fail_usage(FIELD_ORIGINS.describe_faults(to_field_errors(error)))
+    parameters = (*model.parameters, *build_initial_parameters(started, pieces))
     wrong = find_setting_faults(job.to_normal_form(), model, parameters)
     if wrong:
         fail_usage(FIELD_ORIGINS.describe_faults(wrong))

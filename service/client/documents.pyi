@@ -869,6 +869,8 @@ class JobInDocument(TypedDict):
     """weight of each output, one number or one for each experiment. null: 1 for one output, else 1 / its standard deviation; then the noise of each output in each experiment is estimated"""
     skip: NotRequired[int]
     """first samples of each output that are not scored"""
+    initial: NotRequired[Literal["rest", "free", "measured", "auto"] | None]
+    """where the states start: at rest under the first inputs, at estimated or at measured values. auto compares them by the data. null: as the model's document says"""
     algorithm: NotRequired[AlgorithmInDocument]
     """settings of the search"""
     priority: NotRequired[int]
@@ -1665,6 +1667,8 @@ class RunDocument(TypedDict):
     """integration steps in one grid step: the model's, or more"""
     selection: NotRequired[list[SelectedTermDocument] | None]
     """selected terms; empty if none were to be selected"""
+    initial: NotRequired[Literal["rest", "free", "measured"] | None]
+    """start of the states that the estimates assume; none: as the model's document says"""
 
 class RunPageDocument(TypedDict):
     """Runs of a job."""

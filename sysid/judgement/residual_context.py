@@ -12,8 +12,8 @@ from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.core.units import format_unit
 from sysid.data.interpolation import interpolate_channel
 from sysid.data.records import Channel, Record
-from sysid.judgement.fixed_start import compute_start_slopes, list_fixed_starts
 from sysid.judgement.residual_model import ColumnFit, Noise, ResidualModel
+from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.kernels.signals.past_reads import list_delayed_values
 from sysid.models.model import Model
 from sysid.models.ties import collect_parameter_names
@@ -304,7 +304,7 @@ class ResidualContext:
 
         Not of predictions one step ahead, which forget their start.
         """
-        states = list_fixed_starts(self.problem)
+        states = list_assumed_starts(self.problem)
         if self.problem.prediction != "simulation" or len(states) > _MOST_STATES:
             return []
         noise = float(np.sqrt(np.mean(np.square(self.residual_model.residuals))))
