@@ -18,17 +18,18 @@ import json
 import re
 import shlex
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 import numpy as np
 import yaml
 
-from benchmarks.judgement_kinds import KINDS, Case, Truth, draw_case
+from benchmarks.judgement_kinds import KINDS, Case, draw_case
 from benchmarks.real_data.session import data_folder
 from benchmarks.table import Row, Skipped, parser, report
 from lagid import Identification, Recording, read_recording
@@ -36,9 +37,11 @@ from service.cli.common import apply_setting
 from service.jobs.job_schemas import JobIn
 from service.jobs.to_core import read_run_settings
 from sysid.core.errors import SysidError
+from sysid.core.text import rewrite_settings
 from sysid.identification.identify import identify_records
 from sysid.identification.identify_arguments import read_records
 from sysid.models.catalogue.load import resolve_model
+from sysid.results.findings import Finding
 
 SEEDS, QUICK = 10, 1
 FIRST_SEED = 71_000
@@ -88,6 +91,7 @@ class Answer:
     estimates: Mapping[str, Judged]
     findings: tuple[Mapping[str, Any], ...]
     is_reason_true: bool
+    detectable: bool
     advised: Advised | None
     refused: str
     crash: str
@@ -124,15 +128,16 @@ def identify_as_command(
     return identify_records(loaded, read.records, algorithm, fit, options)
 
 
-def compare_truth(found: Identification, truth: Truth) -> dict[str, Judged]:
+def compare_truth(found: Identification, case: Case) -> dict[str, Judged]:
     """Compare the estimates with the truth; a name that the model lacks is left out."""
-    judged = {}
-    for name, values in truth.items():
+    judged, resolution = {}, case.kind.resolution
+    for name, values in case.truth.items():
         one = found.get(name)
         if one is None:
             continue
         far = max(values, key=lambda value, one=one: abs(one.value - value))
-        z = (one.value - far) / one.stderr if one.stderr else None
+        least = resolution * abs(far)
+        z = (one.value - far) / max(one.stderr, least) if one.stderr else None
         ends = one.interval95
         holds = None if ends is None else all(ends[0] <= value <= ends[1] for value in values)
         judged[name] = Judged(one.value, one.stderr, one.status, z, holds, abs(one.value - far))
@@ -153,6 +158,7 @@ def judge_case(task: tuple[str, int]) -> Answer:
         "estimates": {},
         "findings": (),
         "is_reason_true": False,
+        "detectable": False,
         "advised": None,
         "refused": "",
         "crash": "",
@@ -168,9 +174,9 @@ def judge_case(task: tuple[str, int]) -> Answer:
 
 def _tell_answer(case: Case) -> dict[str, Any]:
     found = identify_as_command(case.model, case.recording)
-    findings = getattr(found, "findings", ())
+    findings = found.findings
     first = findings[0] if findings else None
-    estimates = compare_truth(found, case.truth)
+    estimates = compare_truth(found, case)
     settings = read_advice(found)
     return {
         "trust": found.verdict.trust,
@@ -179,42 +185,61 @@ def _tell_answer(case: Case) -> dict[str, Any]:
         "findings": tuple(map(_describe_finding, findings)),
         "is_reason_true": first is not None
         and bool(case.kind.reasons & {first.family, first.explanation}),
+        "detectable": is_detectable(case, found),
         "advised": follow_advice(case, estimates, settings) if settings else None,
     }
 
 
-def _describe_finding(finding: Any) -> dict[str, Any]:
+def is_detectable(case: Case, found: Identification) -> bool:
+    """Whether the record can show the defect to one who knows what it might be.
+
+    The noise is known here. What the fitted model misses of the output without noise is the
+    non-centrality λ of the likelihood ratio. It has to beat Schwarz's penalty of two parameters
+    by 10, "very strong" evidence by Kass and Raftery (1995).
+    """
+    kind = case.kind
+    if kind.group in ("white", "coloured") or kind.detectable == "never":
+        return False
+    if kind.group == "dirty" or kind.detectable == "always":
+        return True
+    ((fitted,),) = found.simulated
+    missed = (case.clean[-fitted.size :] - fitted) / case.noise_sd
+    missed = missed[np.isfinite(missed)]
+    free = sum(one.is_free for one in found.parameters)
+    return bool(np.sum(missed**2) - free > 10.0 + 2.0 * np.log(missed.size))
+
+
+def _describe_finding(finding: Finding) -> dict[str, Any]:
     moves = {move.parameter: [float(move.value), float(move.stderrs)] for move in finding.moves}
     return {
         "explanation": finding.explanation,
         "family": finding.family,
-        "gain": float(finding.gain),
+        "gain": finding.gain,
         "moves": moves,
         "severity": finding.severity,
         "brief": finding.brief,
         "text": finding.text,
-        "advice": str(finding.advice or ""),
+        "advice": finding.advice,
     }
 
 
 def read_advice(found: Identification) -> tuple[str, ...]:
     """Read the verdict's first advice as settings; `model=NAME` is another model."""
-    findings = getattr(found, "findings", ())
-    if findings:
-        return read_settings(str(findings[0].advice or ""))
-    orders = found.order_comparison
-    advises = any("Use that model" in reason.text for reason in found.verdict.reasons[:1])
-    if advises and orders is not None and orders.preferred_model is not None:
-        return (f"model={orders.preferred_model}",)
-    return ()
+    if found.verdict.trust == "trustworthy":
+        return ()
+    advice = found.findings[0].advice
+    models = re.findall(r"the model (\w+)", advice)
+    typed = rewrite_settings(advice, _write_options)
+    return (*(f"model={name}" for name in models), *read_settings(typed))
+
+
+def _write_options(field: str, entries: Mapping[str, str]) -> str:
+    prefix = f"{field}." if field else ""
+    return " ".join(f"--set {prefix}{name}={value}" for name, value in entries.items())
 
 
 def read_settings(text: str) -> tuple[str, ...]:
-    """Read the options of `lagid identify` in a text.
-
-    >>> read_settings("Use --model sopdt, or --set loss.noise_model=ar1.")
-    ('model=sopdt', 'loss.noise_model=ar1')
-    """
+    """Read the options of `lagid identify` in a text."""
     names = {"model": "model", "noise-model": "loss.noise_model"}
     settings = []
     pattern = r"--(set|model|noise-model)[ =]('[^']*'|\"[^\"]*\"|[^\s`,;]+)"
@@ -236,7 +261,7 @@ def follow_advice(
         found = identify_as_command(models[0] if models else case.model, case.recording, changes)
     except (SysidError, click.exceptions.Exit, ValueError) as error:
         return Advised(settings, (), str(error) or "refused")
-    after = compare_truth(found, case.truth)
+    after = compare_truth(found, case)
     worse = [
         name
         for name, one in after.items()
@@ -256,7 +281,7 @@ def tell_each(answer: Answer) -> str:
         for name, one in answer.estimates.items()
     )
     findings = "; ".join(
-        f"{one['family']}/{one['explanation']} gain {one['gain']:.0f}, moves "
+        f"{one['family']}/{one['explanation']} gain {one['gain'] or 0.0:.0f}, moves "
         + ", ".join(f"{name} {move[1]:+.1f}" for name, move in one["moves"].items())
         for one in answer.findings
     )
@@ -265,8 +290,9 @@ def tell_each(answer: Answer) -> str:
     if advised is not None:
         ends = advised.refused or f"worse: {', '.join(advised.worse) or 'nothing'}"
         advice = f" | advice {' '.join(advised.settings)}: {ends}"
-    told = "said" if answer.is_plain else ("TRUE" if answer.is_reason_true else "other")
-    reason = "" if answer.is_plain else f" [{told} reason]"
+    reason = "" if answer.is_plain else f" [{'TRUE' if answer.is_reason_true else 'other'} reason]"
+    if KINDS[answer.kind].group == "defect" and not answer.detectable:
+        reason += " [not detectable]"
     return (
         f"{answer.kind} {answer.seed} {answer.plant}: {answer.verdict}{reason} | z {estimates}"
         f" | {findings or 'no finding'}{advice} | {answer.seconds:.1f} s"
@@ -289,10 +315,12 @@ def write_kind_line(name: str, answers: Sequence[Answer]) -> str:
     ]
     worst = f"{max(far)[1]} {max(far)[0]:.0f}" if far else "–"
     advised = [one.advised for one in answers if one.advised is not None]
+    reasons = Counter(one.findings[0]["explanation"] for one in said if one.findings)
     cells = [
-        name + ("" if KINDS[name].detectable else " (not detectable)"),
+        name,
         KINDS[name].group,
         str(len(answers)),
+        str(sum(one.detectable for one in answers)),
         count("trustworthy"),
         count("limited"),
         count("not trustworthy"),
@@ -300,6 +328,7 @@ def write_kind_line(name: str, answers: Sequence[Answer]) -> str:
         f"{sum(one.is_reason_true for one in said)} of {len(said)}",
         f"{sum(bool(one.worse or one.refused) for one in advised)} of {len(advised)}",
         worst,
+        ", ".join(f"{reason} {number}" for reason, number in reasons.most_common(3)),
     ]
     return f"| {' | '.join(cells)} |"
 
@@ -307,8 +336,9 @@ def write_kind_line(name: str, answers: Sequence[Answer]) -> str:
 def print_kinds(answers: Sequence[Answer]) -> None:
     """Print a line for each kind; numbers in brackets are wrong."""
     print(
-        "\n| kind | group | n | trustworthy (wrong) | but (wrong) | not (wrong) | refused "
-        "| true reason | advice made worse | worst |\n|---|---|--:|--:|--:|--:|--:|--:|--:|---|"
+        "\n| kind | group | n | detectable | trustworthy (wrong) | but (wrong) | not (wrong) "
+        "| refused | true reason | advice made worse | worst | reasons given |"
+        "\n|---|---|--:|--:|--:|--:|--:|--:|--:|--:|---|---|"
     )
     for name in KINDS:
         own = [one for one in answers if one.kind == name]
@@ -318,7 +348,11 @@ def print_kinds(answers: Sequence[Answer]) -> None:
 
 
 def share_row(
-    title: str, those: Sequence[object], of: Sequence[object], bar: float | None, relation: Any
+    title: str,
+    those: Sequence[object],
+    of: Sequence[object],
+    bar: float | None,
+    relation: Literal["<=", ">="],
 ) -> Row | Skipped:
     """A share in per cent, or that there was nothing to count."""
     if not of:
@@ -330,14 +364,14 @@ def share_row(
 def count_answers(answers: Sequence[Answer]) -> list[Row | Skipped]:
     """Count what the issue asks for."""
     spoken = [one for one in answers if one.trust]
-    broken = [
-        one
-        for one in spoken
-        if KINDS[one.kind].group in ("defect", "dirty") and KINDS[one.kind].detectable
-    ]
+    broken = [one for one in spoken if one.detectable]
     hopeful = [one for one in broken if one.trust != "not trustworthy"]
     hedged = [
-        one for one in spoken if KINDS[one.kind].group in ("defect", "dirty") and not one.is_plain
+        one
+        for one in spoken
+        if KINDS[one.kind].group in ("defect", "dirty")
+        and KINDS[one.kind].detectable != "never"
+        and not one.is_plain
     ]
     advised = [one.advised for one in spoken if one.advised is not None]
     rows = [
@@ -432,6 +466,7 @@ def write_cases(tasks: Sequence[tuple[str, int]], folder: Path) -> None:
             "command": f"lagid identify {stem.name}.csv --model {model}",
             "truth": case.truth,
             "reasons": sorted(case.kind.reasons),
+            "group": case.kind.group,
             "detectable": case.kind.detectable,
             "plant": case.plant,
         }
@@ -479,14 +514,7 @@ def compare_halves(folder: Path) -> list[Row | Skipped]:
             identify_as_command(source, cut_half(recording, number), changes) for number in (0, 1)
         ]
         apart = list(_compare_pair(title, *halves))
-        rows.append(
-            Row(
-                f"{title}: identified in both halves, over {APART:g} errors apart",
-                sum(apart),
-                "",
-                0,
-            )
-        )
+        rows.append(Row(f"{title}: identified twice, {APART:g} errors apart", sum(apart), "", 0))
     return rows
 
 
@@ -500,7 +528,8 @@ def _compare_pair(title: str, first: Identification, second: Identification) -> 
         errors = abs(one.value - other.value) / float(np.hypot(one.stderr, other.stderr))
         print(
             f"| {title} | {one.name} | {one.value:.4g} ± {one.stderr:.2g} {one.status} "
-            f"| {other.value:.4g} ± {other.stderr:.2g} {other.status} | {errors:.1f} | {verdicts} |",
+            f"| {other.value:.4g} ± {other.stderr:.2g} {other.status} "
+            f"| {errors:.1f} | {verdicts} |",
             flush=True,
         )
         verdicts = ""

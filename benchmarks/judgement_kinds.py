@@ -26,6 +26,8 @@ from sysid.data.records import Channel, Recording
 
 Group = Literal["defect", "dirty", "white", "coloured"]
 """A defect; sound but rough; sound with white noise; sound with coloured noise."""
+Detectable = Literal["misfit", "always", "never"]
+"""By what the record can show a defect: as far as the model misfits, by its design, by nothing."""
 Truth = Mapping[str, tuple[float, ...]]
 """For each parameter the values that are true in some part of the record."""
 Logged = dict[str, FloatArray]
@@ -36,8 +38,28 @@ LEVELLING = ("fopdt", "sopdt")
 OWN = ("tank", "feedback", "valve", "cooler")
 ALL = (*PROCESSES, *OWN)
 DRIVES = ("steps", "prbs", "step", "smooth")
+FAMILIES = frozenset(
+    [
+        "constancy",
+        "clocks",
+        "sensor",
+        "actuator",
+        "variance",
+        "input",
+        "reading",
+        "start",
+        "history",
+        "structure",
+        "noise",
+        "search",
+        "record",
+    ]
+)
+"""Families of explanations; other words in the reasons of a kind are names of explanations."""
 LIVELY = ("steps", "prbs", "smooth")
 HELD = ("steps", "prbs")
+MANY = ("steps", "smooth")
+"""Inputs of more than two levels: between two levels every characteristic is a straight line."""
 
 
 @dataclass
@@ -65,6 +87,7 @@ class Scene:
     drive: str
     shape: FloatArray
     snr: float
+    noise_sd: float = 0.0
     before: int = 0
     held: bool = True
     values: dict[str, Any] = field(default_factory=dict)
@@ -126,18 +149,15 @@ class Scene:
             y = self.sensor(y)
         u = drive[::FINE] if self.control is not None else self.input_values
         clean = y[: drive.size : FINE][self.before :] if self.sample is None else self.sample(y)
-        if self.sample_input is not None:
-            u = self.sample_input(drive)
-        else:
-            u = u[self.before :]
+        u = u[self.before :] if self.sample_input is None else self.sample_input(drive)
         logged = {"t": self.times, "u": u}
         if self.second is not None:
             logged["v"] = self.second[self.before :]
-        size = float(np.std(clean)) / self.snr if self.snr < np.inf else 0.0
-        noise = self.random.standard_normal(clean.size) * size
-        if self.noise is not None:
-            noise = self.noise(clean, size)
-        logged["y"] = clean + noise
+        size = self.noise_sd = float(np.std(clean)) / self.snr
+        if self.noise is None:
+            logged["y"] = clean + size * self.random.standard_normal(clean.size)
+        else:
+            logged["y"] = clean + self.noise(clean, size)
         return logged if self.log is None else self.log(logged)
 
     def _answer(self, drive: FloatArray, acting: FloatArray) -> FloatArray:
@@ -165,24 +185,26 @@ class Kind:
     reasons : frozenset of str
         Families and names of the explanations that are the true reason.
     group : Group
-    detectable : bool
-        Whether the record alone can show the defect.
+    detectable : Detectable
     plants : tuple of str
         Taken in turn by the seed.
     drives : tuple of str
         One of them is drawn.
     snr : tuple of float
         Range of the signal-to-noise ratio.
+    resolution : float
+        Share of a value that is no error, whatever the standard error: that of the integrators.
     """
 
     name: str
     change: Callable[[Scene], None]
     reasons: frozenset[str]
     group: Group
-    detectable: bool
+    detectable: Detectable
     plants: tuple[str, ...]
     drives: tuple[str, ...]
     snr: tuple[float, float]
+    resolution: float
 
 
 KINDS: dict[str, Kind] = {}
@@ -192,10 +214,11 @@ def kind(
     reasons: str = "",
     *,
     group: Group = "defect",
-    detectable: bool = True,
+    detectable: Detectable = "misfit",
     plants: tuple[str, ...] = ALL,
     drives: tuple[str, ...] = LIVELY,
     snr: tuple[float, float] = (15.0, 100.0),
+    resolution: float = 0.0,
     name: str | None = None,
 ) -> Callable[[Callable[[Scene], None]], Callable[[Scene], None]]:
     """Register a change of a scene as a kind; `reasons` are words."""
@@ -203,7 +226,7 @@ def kind(
     def register(change: Callable[[Scene], None]) -> Callable[[Scene], None]:
         title = name or change.__name__
         told = frozenset(reasons.split())
-        KINDS[title] = Kind(title, change, told, group, detectable, plants, drives, snr)
+        KINDS[title] = Kind(title, change, told, group, detectable, plants, drives, snr, resolution)
         return change
 
     return register
@@ -211,7 +234,10 @@ def kind(
 
 @dataclass(frozen=True)
 class Case:
-    """A record of a kind: what is fitted, the recording, the truth, and the plant's name."""
+    """A record of a kind: what is fitted, the recording, the truth, and the plant's name.
+
+    `noise_sd` is the standard deviation of the noise before the log.
+    """
 
     kind: Kind
     seed: int
@@ -219,6 +245,12 @@ class Case:
     model: str | dict[str, Any]
     logged: Logged
     truth: Truth
+    noise_sd: float
+
+    @property
+    def clean(self) -> FloatArray:
+        """Logged output of the same experiment without noise."""
+        return draw_case(self.kind.name, self.seed, quiet=True).logged["y"]
 
     @property
     def recording(self) -> Recording:
@@ -228,8 +260,8 @@ class Case:
         return Recording(tuple(Channel(key, times, self.logged[key]) for key in names))
 
 
-def draw_case(name: str, seed: int) -> Case:
-    """Draw the record of a kind and a seed."""
+def draw_case(name: str, seed: int, *, quiet: bool = False) -> Case:
+    """Draw the record of a kind and a seed; `quiet` leaves out the noise, and nothing else."""
     kind = KINDS[name]
     random = np.random.default_rng([seed, crc32(name.encode())])
     plant_name = kind.plants[seed % len(kind.plants)]
@@ -250,8 +282,11 @@ def draw_case(name: str, seed: int) -> Case:
         other = draw_steps(random, scene.count, plant, rest=0)
         scene.second = plant.base + 5.0 + 2.0 * other if plant.base else other
         scene.held = True
+    if quiet:
+        scene.snr = np.inf
     kind.change(scene)
-    return Case(kind, seed, plant_name, scene.model, scene.run(), scene.truth)
+    logged = scene.run()
+    return Case(kind, seed, plant_name, scene.model, logged, scene.truth, scene.noise_sd)
 
 
 def write_record(name: str, seed: int) -> tuple[str | dict[str, Any], Recording, Truth]:
@@ -319,7 +354,7 @@ def draw_moment(scene: Scene, low: float = 0.35, high: float = 0.65) -> float:
 
 def change_value(scene: Scene, name: str, factor: float, *, slowly: bool = False) -> None:
     """Let a parameter change by a factor, at a moment or along a straight line."""
-    before = scene.plant.truth[name]
+    before, factor = scene.plant.truth[name], float(factor)
     if slowly:
         share = np.clip(scene.clock / scene.duration, 0.0, 1.0)
     else:
@@ -364,14 +399,17 @@ def spread(values: FloatArray) -> float:
 
 # Sound records
 
+_TELLING = {"sopdt": (20.0, 100.0), "cooler": (20.0, 100.0), "valve": (10.0, 100.0)}
+"""Ranges of the signal-to-noise ratio from where on the record determines all parameters."""
 for _plant in PLANTS:
-    _drives = HELD if _plant in ("mixer", "twin") else DRIVES
-    kind(group="white", plants=(_plant,), drives=_drives, snr=(5.0, 100.0), name=f"sound_{_plant}")(
+    _drives = DRIVES if _plant in ("fopdt", "ipdt") else HELD
+    _snr = _TELLING.get(_plant, (5.0, 100.0))
+    kind(group="white", plants=(_plant,), drives=_drives, snr=_snr, name=f"sound_{_plant}")(
         lambda _scene: None
     )
 
 
-@kind(group="white", plants=("fopdt", "sopdt", "tank"), drives=("smooth",), snr=(10.0, 100.0))
+@kind(group="white", plants=("fopdt", "tank", "valve"), drives=("smooth",), snr=(10.0, 100.0))
 def sound_smooth(scene: Scene) -> None:
     """A smooth input."""
 
@@ -389,7 +427,13 @@ def sound_long(scene: Scene) -> None:
     scene.shape = np.concatenate([scene.shape, *parts])[:5000]
 
 
-@kind(group="white", plants=("fopdt", "sopdt", "cooler"), drives=HELD, snr=(1.0, np.inf))
+@kind(
+    group="white",
+    plants=("fopdt", "sopdt", "cooler"),
+    drives=HELD,
+    snr=(1.0, np.inf),
+    resolution=1e-4,
+)
 def sound_noise_free(scene: Scene) -> None:
     """No noise but the rounding to 12 digits."""
     scene.log = lambda log: log | {"y": np.array([float(f"{one:.12g}") for one in log["y"]])}
@@ -442,7 +486,7 @@ def sound_long_ar1(scene: Scene) -> None:
 # Clocks
 
 
-@kind("clocks", detectable=False)
+@kind("clocks", detectable="never")
 def clock_offset_hidden(scene: Scene) -> None:
     """The clock of y is late by less than can be seen."""
     late = scene.random.uniform(0.2, 0.6) * scene.plant.slow
@@ -826,7 +870,12 @@ def close_loop(scene: Scene, target: FloatArray, strength: float) -> None:
     scene.noise = lambda clean, _: noise[: clean.size]
 
 
-@kind("noise input record search feedback", plants=("fopdt", "sopdt", "ipdt"), drives=("steps",))
+@kind(
+    "noise input record search feedback",
+    plants=("fopdt", "sopdt", "ipdt"),
+    drives=("steps",),
+    detectable="always",
+)
 def loop_without_dither(scene: Scene) -> None:
     """A loop that only a load and noise move."""
     close_loop(scene, np.zeros(scene.shape.size), 0.35)
@@ -839,13 +888,25 @@ def loop_without_dither(scene: Scene) -> None:
     scene.load = np.repeat(walk, FINE) * rate
 
 
-@kind("noise input record feedback", group="dirty", plants=PROCESSES, drives=("steps",))
+@kind(
+    "noise input record feedback",
+    group="dirty",
+    plants=PROCESSES,
+    drives=("steps",),
+    detectable="always",
+)
 def loop_with_dither(scene: Scene) -> None:
     """A loop with changes of its set point."""
     close_loop(scene, scene.shape.copy(), 0.3)
 
 
-@kind("noise input record search feedback", group="dirty", plants=PROCESSES, drives=("steps",))
+@kind(
+    "noise input record search feedback",
+    group="dirty",
+    plants=PROCESSES,
+    drives=("steps",),
+    detectable="always",
+)
 def loop_relay(scene: Scene) -> None:
     """A relay with hysteresis keeps y about its target."""
     plant = scene.plant
@@ -867,7 +928,7 @@ def loop_relay(scene: Scene) -> None:
 # Actuator
 
 
-@kind("actuator")
+@kind("actuator", drives=MANY)
 def input_limit(scene: Scene) -> None:
     """The actuator ends at a part of its range."""
     edge = scene.plant.base + scene.random.uniform(0.2, 0.5) * scene.plant.span
@@ -889,7 +950,7 @@ def rate_limit(scene: Scene) -> None:
     scene.actuator = move
 
 
-@kind("actuator")
+@kind("actuator", drives=MANY)
 def backlash(scene: Scene) -> None:
     """The actuator has play."""
     half = scene.random.uniform(0.15, 0.35) * scene.plant.span
@@ -904,7 +965,7 @@ def backlash(scene: Scene) -> None:
     scene.actuator = play
 
 
-@kind("actuator", plants=(*PROCESSES, "feedback", "cooler"))
+@kind("actuator", plants=(*PROCESSES, "feedback", "cooler"), drives=MANY)
 def dead_zone(scene: Scene) -> None:
     """Small inputs do nothing."""
     half = scene.random.uniform(0.2, 0.4) * scene.plant.span
@@ -912,7 +973,7 @@ def dead_zone(scene: Scene) -> None:
     scene.actuator = lambda u: base + np.sign(u - base) * np.maximum(np.abs(u - base) - half, 0.0)
 
 
-@kind("actuator structure constancy", plants=(*PROCESSES, "cooler", "feedback"))
+@kind("actuator structure constancy", plants=(*PROCESSES, "cooler", "feedback"), drives=MANY)
 def heat_and_cool(scene: Scene) -> None:
     """The gain of one direction is smaller than that of the other."""
     share, base = scene.random.uniform(0.45, 0.75), scene.plant.base
@@ -921,7 +982,7 @@ def heat_and_cool(scene: Scene) -> None:
     scene.truth[name] = (scene.plant.truth[name], share * scene.plant.truth[name])
 
 
-@kind("actuator structure sensor", plants=LEVELLING)
+@kind("actuator structure sensor", plants=LEVELLING, drives=MANY)
 def actuator_curve(scene: Scene) -> None:
     """The valve's characteristic bends."""
     base, span = scene.plant.base, scene.plant.span
@@ -990,11 +1051,16 @@ def missing_input_recorded(scene: Scene) -> None:
     scene.log = lambda log: log | {"w": other}
 
 
-@kind("record search input history reading", plants=("fopdt", "tank", "valve"), drives=("steps",))
+@kind(
+    "record search input history reading",
+    plants=("fopdt", "tank", "valve"),
+    drives=("steps",),
+    detectable="always",
+)
 def periodic_input(scene: Scene) -> None:
     """Cut from a longer record under an exactly periodic input."""
     every = max(6, round(scene.random.uniform(1.5, 3.0) * scene.plant.slow / scene.plant.period))
-    scene.before = 40 * every
+    scene.before = 12 * every
     wave = np.arange(scene.before + 400) % every < 0.4 * every
     scene.shape = np.where(wave, 0.8, -0.6)
 
@@ -1014,23 +1080,25 @@ def take_means(scene: Scene, shift: float) -> Callable[[FloatArray], FloatArray]
     return take
 
 
-def switch_between(scene: Scene) -> None:
-    """Let the input switch between samples, as a person does."""
-    moved = scene.random.integers(0, FINE)
-    scene.actuator = lambda u: np.r_[np.full(moved, u[0]), u][: u.size]
+def switch_early(scene: Scene) -> Callable[[FloatArray], FloatArray]:
+    """Let each step of the input come before the sample that shows it, by less than a period."""
+    early = scene.random.integers(0, FINE, scene.shape.size)
+
+    def switch(u: FloatArray) -> FloatArray:
+        out = u.copy()
+        for k in np.flatnonzero(np.diff(u)) + 1:
+            out[k - early[k // FINE] : k] = u[k]
+        return out
+
+    return switch
 
 
-@kind("reading input", drives=("steps",))
+@kind("reading input", drives=("steps",), detectable="always")
 def block_means(scene: Scene) -> None:
     """The log has means of both channels, and the input switches at any time."""
     shift = float(scene.random.choice([0.0, 1.0]))
     scene.sample = take_means(scene, shift)
-    moved = int(scene.random.integers(1, FINE))
-
-    def switch(u: FloatArray) -> FloatArray:
-        return np.r_[np.full(moved, u[0]), u][: u.size]
-
-    scene.actuator = switch
+    scene.actuator = switch = switch_early(scene)
     scene.sample_input = lambda u: take_means(scene, shift)(np.r_[switch(u), u[-1]])
 
 
@@ -1049,12 +1117,10 @@ def block_mean_end(scene: Scene) -> None:
 @kind("reading input clocks", drives=("steps", "prbs"))
 def switched_between_samples(scene: Scene) -> None:
     """The input switches between two samples."""
-    switch_between(scene)
-    lag = scene.plant.truth["L"]
-    scene.truth["L"] = (lag, lag + scene.plant.period)
+    scene.actuator = switch_early(scene)
 
 
-@kind("reading record noise structure", drives=("steps", "smooth"))
+@kind("reading record noise structure", drives=("steps", "smooth"), detectable="always")
 def resampled(scene: Scene) -> None:
     """The log was interpolated to a denser grid."""
     dense = scene.plant.period / scene.random.uniform(1.7, 3.3)
@@ -1068,7 +1134,7 @@ def resampled(scene: Scene) -> None:
     scene.log = interpolate
 
 
-@kind("reading record noise sensor variance", drives=("steps", "smooth"))
+@kind("reading record noise sensor variance", drives=("steps", "smooth"), detectable="always")
 def repeated_rows(scene: Scene) -> None:
     """Each row is written three times, at its own stamp."""
 
@@ -1115,7 +1181,7 @@ def two_missing_orders(scene: Scene) -> None:
     use_process(scene, "fopdt", "K", "L")
 
 
-@kind("structure", plants=("fopdt",), drives=DRIVES, group="dirty")
+@kind("structure", plants=("fopdt",), drives=DRIVES, group="dirty", detectable="always")
 def too_high_order(scene: Scene) -> None:
     """Second order is fitted to first order: sound, but for what is not there."""
     scene.truth["T1"] = scene.truth["T"]
@@ -1237,7 +1303,7 @@ def two_paths(scene: Scene) -> None:
     use_process(scene, "fopdt", "L")
 
 
-@kind("structure search record ambiguous combination", plants=("fopdt",))
+@kind("structure search record ambiguous combination", plants=("fopdt",), detectable="always")
 def two_lags_sum(scene: Scene) -> None:
     """The model has two delays that only act as a sum."""
     plant = scene.plant
@@ -1258,7 +1324,7 @@ def two_lags_sum(scene: Scene) -> None:
     scene.truth |= {"L": (0.0, lag), "M": (0.0, lag)}
 
 
-@kind("structure search sensor record", plants=("fopdt",))
+@kind("structure search sensor record", plants=("fopdt",), detectable="always")
 def sign_reversed(scene: Scene) -> None:
     """The model allows no gain of this sign."""
     plant = scene.plant
@@ -1278,7 +1344,12 @@ def sign_reversed(scene: Scene) -> None:
     scene.truth["K"] = (scene.values["K"],)
 
 
-@kind("structure record input reading search", plants=("fopdt", "sopdt"), drives=HELD)
+@kind(
+    "structure record input reading search",
+    plants=("fopdt", "sopdt"),
+    drives=HELD,
+    detectable="always",
+)
 def swapped_channels(scene: Scene) -> None:
     """Input and output are exchanged."""
     scene.log = lambda log: {"t": log["t"], "u": log["y"], "y": log["u"]}
@@ -1287,26 +1358,42 @@ def swapped_channels(scene: Scene) -> None:
 # Start and end of the record
 
 
-@kind("record start history search", plants=("fopdt", "tank", "valve"), drives=("step",))
+@kind(
+    "record start history search",
+    plants=("fopdt", "tank", "valve"),
+    drives=("step",),
+    detectable="always",
+)
 def step_at_0(scene: Scene) -> None:
     """The step is made as the record begins: the logged input is constant."""
     scene.before = int(np.argmax(scene.shape != 0.0))
 
 
-@kind("record start history", group="dirty", plants=("fopdt", "tank"), drives=("step",))
+@kind(
+    "record start history",
+    group="dirty",
+    plants=("fopdt", "tank"),
+    drives=("step",),
+    detectable="always",
+)
 def step_at_first_row(scene: Scene) -> None:
     """Only one sample is before the step."""
     scene.before = int(np.argmax(scene.shape != 0.0)) - 1
 
 
-@kind("record start structure search", plants=("fopdt", "sopdt"), drives=("smooth",))
+@kind(
+    "record start structure search",
+    plants=("fopdt", "sopdt"),
+    drives=("smooth",),
+    detectable="always",
+)
 def ramp_only(scene: Scene) -> None:
     """The input is one long ramp."""
     rest = int(2.0 * scene.plant.slow / scene.plant.period)
     scene.shape = np.maximum(np.arange(300) - rest, 0.0) / (300.0 - rest)
 
 
-@kind("record search structure", plants=("fopdt", "sopdt", "cooler"), drives=("step",))
+@kind("record search structure", plants=LEVELLING, drives=("step",), detectable="always")
 def short_record(scene: Scene) -> None:
     """The record ends soon after the response has begun."""
     rest = int(np.argmax(scene.shape != 0.0))
@@ -1352,7 +1439,12 @@ def not_at_rest(scene: Scene) -> None:
         scene.second = np.r_[np.full(scene.before, scene.second[0]), scene.second]
 
 
-@kind("start record history", plants=(*LEVELLING, "valve", "cooler"), drives=("step",))
+@kind(
+    "start record history",
+    plants=(*LEVELLING, "valve", "cooler"),
+    drives=("step",),
+    detectable="always",
+)
 def short_rest(scene: Scene) -> None:
     """Two samples of rest before the step."""
     rest = int(np.argmax(scene.shape != 0.0))
@@ -1388,7 +1480,7 @@ def nan_blocks(scene: Scene) -> None:
     scene.log = lose
 
 
-@kind("clocks record", detectable=False, plants=("fopdt", "valve"))
+@kind("clocks record", detectable="never", plants=LEVELLING)
 def minutes_called_seconds(scene: Scene) -> None:
     """Times are minutes, and nothing says so."""
     scene.log = lambda log: log | {"t": log["t"] / 60.0}

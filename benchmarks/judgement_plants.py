@@ -163,7 +163,11 @@ def write_document(
         "inputs": dict.fromkeys(inputs, "1"),
         "states": dict.fromkeys(equations, "1"),
         "parameters": {
-            key: {"lower": float(f"{low:.1g}"), "upper": float(f"{high:.1g}")}
+            key: {
+                "lower": float(f"{low:.1g}"),
+                "upper": float(f"{high:.1g}"),
+                "unit": "s" if key in ("T", "L") else "1",
+            }
             for key, (low, high) in bounds.items()
         },
         "equations": dict(equations),

@@ -60,6 +60,7 @@ def list_parts(seed: int) -> dict[str, Part]:
         "robustness": program("benchmarks.robustness", "--first-seed", str(1000 * seed)),
         "efficiency": program("benchmarks.efficiency"),
         "traps": program("benchmarks.traps"),
+        "judgement": program("benchmarks.judgement", "--workers", "2", "--first", str(100 * seed)),
         "coverage": program("benchmarks.coverage", "--jobs", "2"),
         "noise models": program("benchmarks.noise_models", "--jobs", "2"),
         "torture": program("benchmarks.torture", "--seed", str(seed)),

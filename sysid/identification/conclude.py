@@ -185,7 +185,7 @@ def _build_identification(
             *find_contradictions(problem, metrics, validated, estimates),
             *find_misled_run(estimates, ahead),
             *select_explanations(
-                () if is_of_the_solver else explained.findings,
+                () if is_of_the_solver or feedback else explained.findings,
                 [
                     *find_other_orders(orders, problem.model.name, estimates),
                     *find_other_readings(problem, holds, doubts, estimates, rms),
@@ -276,6 +276,7 @@ def _build_identification(
         order_comparison=orders,
         delays=tuple(sorted(delays)),
         findings=findings,
+        explained=explained.is_done,
         verdict=conclude_verdict(analysis.estimates, findings, declared),
         warnings=list_warnings(findings),
         substeps=problem.model.solver.substeps,

@@ -23,7 +23,7 @@ from sysid.identification.request import IdentificationRequest, accept_fields
 from sysid.identification.run import advance_run, begin_run, is_finished
 from sysid.islands.run_state import RunState
 from sysid.judgement.agreement import find_constant_outputs
-from sysid.judgement.conclusions import list_warnings
+from sysid.judgement.conclusions import add_reading_notes, list_warnings
 from sysid.models.catalogue.load import resolve_model
 from sysid.models.model import Model
 from sysid.models.model_delays import check_unused_settings
@@ -146,9 +146,9 @@ def identify(request: IdentificationRequest) -> Identification:
         progress=request.progress,
     )
     assert result.data is not None
-    notes = (rewrite_settings(note, write_setting) for note in result.warnings)
+    warnings = tuple(rewrite_settings(note, write_setting) for note in result.warnings)
     data = replace(result.data, channels=read.channels)
-    return replace(result, warnings=(*read.notes, *notes), data=data)
+    return add_reading_notes(replace(result, warnings=warnings, data=data), read.notes)
 
 
 def _read_data(

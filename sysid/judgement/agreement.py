@@ -26,6 +26,7 @@ def find_disagreement(
             "the model is invalid",
             f"the RMS error {metrics.rms:.4g} is above the safe limit {limit:g}, so the model is "
             "not valid.",
+            status="refuted",
         )
     fit = metrics.fit_percent
     if isfinite(fit) and fit <= 0:
@@ -36,6 +37,7 @@ def find_disagreement(
             "the model does not explain the output",
             f"the fit is {fit:.1f} %: a constant fits {'better' if fit < 0 else 'as well'}.",
             "Choose another model, or look at channels and bounds.",
+            status="refuted",
         )
     elif isfinite(fit) and fit < _LITTLE and not are_residuals_noise:
         yield Finding(
@@ -45,6 +47,7 @@ def find_disagreement(
             "the model explains little of the output",
             f"the fit is {fit:.1f} %, and what is left is not noise.",
             "Choose another model, or look at channels and bounds.",
+            status="refuted",
         )
     yield from _find_straight_lines(metrics.channels)
 
@@ -94,6 +97,7 @@ def _find_straight_lines(channels: Sequence[ChannelMetrics]) -> Iterator[Finding
             "Choose another model, or look at channels, bounds, and a change during the recording."
             if failed
             else "These records tell little of the model, or it does not hold there.",
+            status="refuted",
         )
 
 

@@ -6,14 +6,21 @@ never make a verdict milder, nor a status.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from sysid.core.text import join_names, plain_estimate, plain_unit
-from sysid.judgement.levels import NOTABLE_MOVE
-from sysid.results.findings import Finding, Severity
+from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE
+from sysid.results.findings import Finding, Severity, note
 from sysid.results.verdict import Verdict
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
 
+if TYPE_CHECKING:
+    from sysid.results.identification import Identification
+
+_MOST_REASONS = 2  # of an estimate, and in a verdict
+
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
+_OF_NOISE = ("outliers", "unequal variance", "coloured noise")
 _RANKS: tuple[EstimateStatus, ...] = (
     "identified",
     "dependent",
@@ -25,20 +32,21 @@ _RANKS: tuple[EstimateStatus, ...] = (
 
 
 def order_findings(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Order findings: the most severe first, and among these the largest gain.
+    """Order findings: explanations with a clear gain, then what is severe, then notes.
 
-    Findings that nothing is compared for follow those with a gain, in their order.
+    Explanations of what the model leaves come before those of its noise. Within each group the
+    largest gain is first; what is not compared follows in its order.
     """
     return tuple(
-        sorted(
-            findings,
-            key=lambda one: (
-                _SEVERITIES.index(one.severity),
-                one.gain is None,
-                -(one.gain or 0.0),
-            ),
-        )
+        sorted(findings, key=lambda one: (_find_group(one), one.gain is None, -(one.gain or 0.0)))
     )
+
+
+def _find_group(finding: Finding) -> int:
+    is_clear = finding.gain is not None and finding.gain > DEFECT_GAIN
+    if is_clear and finding.explanation not in _OF_NOISE:
+        return 0
+    return 1 + _SEVERITIES.index(finding.severity)
 
 
 def conclude_estimates(
@@ -49,16 +57,26 @@ def conclude_estimates(
 
 
 def _conclude_estimate(estimate: Estimate, findings: Sequence[Finding]) -> Estimate:
-    if estimate.status not in _RANKS:
+    against = [one for one in findings if _is_against(one, estimate)]
+    if not against or estimate.status not in _RANKS:
         return estimate
-    against = [one for one in findings if estimate.name in one.parameters and one.status in _RANKS]
-    if not against:
-        return estimate
-    status = max((one.status for one in against), key=_RANKS.index)
-    if _RANKS.index(status) <= _RANKS.index(estimate.status):
-        return estimate
-    first = next(one for one in against if one.status == status)
-    return replace(estimate, status=status, reason=_explain(estimate, first))
+    statuses = (estimate.status, *(one.status for one in against))
+    known = "" if estimate.status == "identified" else estimate.reason
+    found = [_explain(estimate, one) for one in against if one.status != estimate.status]
+    reasons = dict.fromkeys(reason for reason in (known, *found) if reason)
+    return replace(
+        estimate,
+        status=max(statuses, key=_RANKS.index),
+        reason="; ".join(list(reasons)[:_MOST_REASONS]),
+    )
+
+
+def _is_against(finding: Finding, estimate: Estimate) -> bool:
+    """Whether a finding makes an estimate doubtful; a serious one without names does all."""
+    if finding.severity == "note" or finding.status not in _RANKS:
+        return False
+    is_for_all = finding.severity == "serious" and not finding.parameters
+    return estimate.name in finding.parameters or (is_for_all and estimate.is_free)
 
 
 def _explain(estimate: Estimate, finding: Finding) -> str:
@@ -77,7 +95,7 @@ def conclude_verdict(
     """Conclude the verdict from findings in their order, and from the statuses that they gave.
 
     A result is not trustworthy if a finding says so, or if findings leave none of the parameters
-    that the model declares identified.
+    that the model declares identified. The text names the first two causes of doubt.
 
     Examples
     --------
@@ -90,18 +108,37 @@ def conclude_verdict(
     >>> conclude_verdict([gain, replace(lag, status="dependent")], [moved], ["K", "L"]).text
     'trustworthy but for L: the data prefer sopdt'
     """
-    first = findings[0] if findings else None
-    if first is None or first.severity == "note":
+    severe = [one for one in findings if one.severity != "note"]
+    if not severe:
         return Verdict("trustworthy", "trustworthy")
+    cause = ", and ".join(_list_causes(findings[0], severe))
+    is_serious = any(one.severity == "serious" for one in severe)
     names = set(declared)
     free = [one for one in estimates if one.is_free and one.name in names]
     doubtful = [one.name for one in free if one.status != "identified"]
-    if first.severity == "serious" or (free and len(doubtful) == len(free)):
-        brief = first.brief
-        text = brief if brief.startswith("not ") else f"not trustworthy: {brief}"
+    if is_serious or (free and len(doubtful) == len(free)):
+        text = cause if cause.startswith("not ") else f"not trustworthy: {cause}"
         return Verdict("not trustworthy", text)
     but = f" but for {join_names(doubtful)}:" if doubtful else ", but"
-    return Verdict("limited", f"trustworthy{but} {first.brief}")
+    return Verdict("limited", f"trustworthy{but} {cause}")
+
+
+def _list_causes(first: Finding, severe: Sequence[Finding]) -> list[str]:
+    """List the briefs that a verdict names: the likeliest cause of doubt, and one more.
+
+    That is the most severe one, then a note that explains the data better, then the next.
+    """
+    worst = min(severe, key=lambda one: _SEVERITIES.index(one.severity))
+    notes = [first] if first.severity == "note" else []
+    return list(dict.fromkeys(one.brief for one in (severe[0], worst, *notes, *severe)))[
+        :_MOST_REASONS
+    ]
+
+
+def add_reading_notes(found: "Identification", texts: Sequence[str]) -> "Identification":
+    """Add to a result what was noted when its recording was read, after what was found."""
+    notes = [note("recording", "record", text) for text in texts]
+    return replace(found, findings=(*found.findings, *notes), warnings=(*found.warnings, *texts))
 
 
 def list_warnings(findings: Sequence[Finding]) -> tuple[str, ...]:

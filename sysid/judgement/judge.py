@@ -1,38 +1,53 @@
 """The judge: which explanations of the residuals are more likely than noise, and what they move."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.text import plain_estimate, plain_unit
+from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import FloatArray
-from sysid.judgement.explanations import actuator, constancy, history, reading, sensor, structure
+from sysid.judgement.explanations import (
+    actuator,
+    constancy,
+    history,
+    numerics,
+    reading,
+    sensor,
+    structure,
+)
 from sysid.judgement.explanations.noise import (
     find_disagreement_of_frequencies,
     find_noise,
 )
-from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE, STRONG_ODDS
+from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE, STRONG_ODDS, UNLIKELY_MOVE
 from sysid.judgement.residual_context import Candidate, ResidualContext
 from sysid.judgement.residual_model import ColumnFit
 from sysid.results.findings import Finding, Move
 
 _PROPOSERS = (
+    numerics.propose,
     constancy.propose,
     sensor.propose,
     structure.propose,
     history.propose,
     reading.propose,
     actuator.propose,
+    actuator.propose_loads,
 )
 _MOST_FINDINGS = 3  # that are found beside each other
 _MOST_TOLD = 3  # moves in a sentence
+_MOST_REFITTED = 3  # explanations that are fitted in full
 
 
 class _Scored(NamedTuple):
+    """A candidate with its gain; `moves` are those of a full fit, if there was one."""
+
     candidate: Candidate
     fit: ColumnFit
     gain: float
+    moves: tuple[Move, ...] | None = None
 
 
 class Explained(NamedTuple):
@@ -62,6 +77,8 @@ def explain_residuals(context: ResidualContext) -> Explained:
     findings: list[Finding] = []
     while len(findings) < _MOST_FINDINGS:
         scored = _score(context, candidates, taken, counted, base.criterion)
+        if not findings:
+            scored = _refit_finalists(context, scored, base.criterion)
         if not scored or scored[0].gain <= DEFECT_GAIN:
             break
         best = scored[0]
@@ -72,6 +89,8 @@ def explain_residuals(context: ResidualContext) -> Explained:
             and one.candidate.explanation != best.candidate.explanation
         ]
         findings.append(_describe(context, best, base, rivals))
+        if best.moves is not None:
+            break  # the estimate is another one then
         taken = np.hstack([taken, best.candidate.columns])
         counted += best.candidate.counted
         base = best.fit
@@ -114,14 +133,73 @@ def _score(
     return sorted(scored, key=lambda one: -one.gain)
 
 
+def _refit_finalists(
+    context: ResidualContext, scored: Sequence[_Scored], criterion: float
+) -> list[_Scored]:
+    """Fit in full the likeliest explanations of which each is another record.
+
+    They may move the parameters by far more than a linear step.
+    """
+    refitted, tried = list(scored), dict[str, int]()
+    for position, one in enumerate(scored):
+        name = one.candidate.explanation
+        if len(tried) == _MOST_REFITTED or one.gain <= 0.0:
+            break
+        if one.candidate.records is None or name in tried:
+            continue
+        tried[name] = position
+        found = context.refit(one.candidate.records)
+        if found is None:
+            continue
+        used = (1 + one.candidate.counted) * np.log(max(context.times.size, 2))
+        gain = criterion - found.criterion - used
+        if gain > one.gain - STRONG_ODDS:
+            refitted[position] = one._replace(gain=max(gain, one.gain), moves=found.moves)
+    parted = _part_finalist(context, scored, criterion)
+    return sorted([*refitted, *parted], key=lambda one: -one.gain)
+
+
+def _part_finalist(
+    context: ResidualContext, scored: Sequence[_Scored], criterion: float
+) -> list[_Scored]:
+    """Fit both sides of the likeliest moment of a change by themselves."""
+    likeliest = next((one for one in scored if one.candidate.moment is not None), None)
+    if likeliest is None or likeliest.gain <= 0.0:
+        return []
+    moment = likeliest.candidate.moment or 0.0
+    found = context.refit_parts(moment)
+    if found is None:
+        return []
+    gain = criterion - found.criterion
+    changed = [one for one in found.changes if one[0] > UNLIKELY_MOVE][:_MOST_TOLD]
+    if not changed or gain < likeliest.gain + STRONG_ODDS:
+        return []
+    names = join_names([name for _, name, _, _ in changed])
+    verb = "change" if len(changed) > 1 else "changes"
+    told = ", ".join(f"{name} from {a:.4g} to {b:.4g}" for _, name, a, b in changed)
+    is_lag = changed[0][1] in context.delays
+    candidate = replace(
+        likeliest.candidate,
+        explanation="change of a time lag" if is_lag else "change of a parameter",
+        family="constancy",
+        brief=f"{names} {verb} at about {moment:.4g} s",
+        text=f"at about {moment:.4g} s {names} {verb}, or what is measured does: {told}",
+        advice="Identify both parts by themselves: give each a label in a column for --segments.",
+        describe=None,
+    )
+    return [_Scored(candidate, likeliest.fit, gain, found.moves)]
+
+
 def _describe(
     context: ResidualContext, best: _Scored, base: ColumnFit, rivals: Sequence[_Scored]
 ) -> Finding:
     candidate = best.candidate
-    moves = context.compute_moves(best.fit, base)
-    notable = {move.parameter for move in moves if abs(move.stderrs) > NOTABLE_MOVE}
+    moves = best.moves or context.compute_moves(best.fit, base, candidate.varies)
+    notable = _list_notable(moves)
     for rival in rivals:
-        notable |= _list_notable(context.compute_moves(rival.fit, base))
+        notable |= _list_notable(context.compute_moves(rival.fit, base, rival.candidate.varies))
+    if candidate.is_vague:
+        notable = {move.parameter for move in moves}
     text = f"{candidate.text}."
     if candidate.describe is not None:
         text += f" {candidate.describe(best.fit)}"
@@ -166,6 +244,8 @@ def select_explanations(
     against them, beside the likeliest one, are left out. What was found beside the likeliest one
     stays with it.
     """
+    names = {one.explanation for one in explained}
+    refitted = [one for one in refitted if one.explanation not in names or not one.parameters]
     first = max((one.gain or 0.0 for one in explained), default=0.0)
     other = max((one.gain or 0.0 for one in refitted), default=0.0)
     kept = [one for one in refitted if one.gain is None or (one.gain or 0.0) > first - STRONG_ODDS]

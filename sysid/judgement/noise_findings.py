@@ -19,7 +19,14 @@ def find_feedback(problem: Problem, simulated: FloatArray, analysis: Analysis) -
     if uncertainty is not None and uncertainty.noise_colour == "white":
         return
     for text in describe_feedback(list_residual_series(problem, simulated)):
-        yield note("feedback", "input", text)
+        yield Finding(
+            "feedback",
+            "input",
+            "caution",
+            "the input follows the output: a closed loop without excitation",
+            text,
+            parameters=tuple(one.name for one in analysis.estimates if one.is_free),
+        )
 
 
 def find_noise_model(

@@ -1,24 +1,34 @@
 """What explanations of residuals start from: residuals, sensitivities, and the model itself."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.core.units import format_unit
+from sysid.data.interpolation import interpolate_channel
 from sysid.data.records import Channel, Record
 from sysid.judgement.residual_model import ColumnFit, Noise, ResidualModel
+from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.kernels.signals.past_reads import list_delayed_values
+from sysid.models.model import Model
 from sysid.models.ties import collect_parameter_names
 from sysid.residuals.series import ResidualPart, iterate_parts
 from sysid.results.findings import Family, Move
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale
+from sysid.uncertainty.sensitivities import compute_sensitivities
 
 _EDGE_SHARE = 0.05  # of an experiment at either end, in which no change is looked for
+_REFIT_STEPS = 12  # of least squares, from the estimate
+_AFTER = 0.01  # of a period: a held input has jumped then
+_MOST_STATES = 8  # whose starts are looked at
+_SHOCKS = 3  # innovations that are looked at
 _OWN_SHARE = 1e-6  # of a column that no parameter explains: less says nothing
 
 
@@ -35,7 +45,16 @@ class Candidate:
     counted : int
         Parameters beside the coefficients, such as a position that was chosen.
     describe : callable or None
-        Completes the text from the coefficients (q,), and from values of the parameters.
+        Completes the text from the fit.
+    varies : tuple of int and two floats, or None
+        Number of the parameter that is not one value, and the least and largest share of the last
+        coefficient that is added to it.
+    moment : float or None
+        Where something changes, s.
+    records : sequence of Record, or None
+        Records with which the model is fitted again, for moves that are not linear.
+    is_vague : bool
+        Whether it leaves open what the model lacks: then no parameter is safe.
     """
 
     explanation: str
@@ -46,6 +65,10 @@ class Candidate:
     advice: str = ""
     counted: int = 0
     describe: Callable[[ColumnFit], str] | None = None
+    varies: tuple[int, float, float] | None = None
+    moment: float | None = None
+    records: Sequence[Record] | None = None
+    is_vague: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,33 +147,134 @@ class ResidualContext:
         columns = values[:, None] if values.ndim == 1 else values
         return self.weight[:, None] * columns
 
-    def compute_moves(self, fit: ColumnFit, base: ColumnFit) -> tuple[Move, ...]:
-        """Compute how far a fit moves the parameters from another one, the furthest first."""
+    def compute_moves(
+        self, fit: ColumnFit, base: ColumnFit, varies: tuple[int, float, float] | None = None
+    ) -> tuple[Move, ...]:
+        """Compute how far a fit moves the parameters from another one, the furthest first.
+
+        A parameter that varies moves to that of its values that is furthest.
+        """
         d = self.theta.size
         scale = compute_physical_scale(self.problem, self.theta)
         steps = (fit.coefficients[:d] - base.coefficients[:d]) * scale
         errors = fit.errors[:d] * scale
+        if varies is not None:
+            number, *shares = varies
+            change = float(fit.coefficients[-1] * scale[number])
+            ends = [float(steps[number]) + share * change for share in shares]
+            steps[number] = max(ends, key=abs)
         known = {estimate.name: estimate for estimate in self.analysis.estimates}
-        moves = []
+        return _order_moves(
+            Move(
+                name,
+                float(self.theta[number] + steps[number]),
+                float(errors[number]),
+                float(steps[number] / stderr),
+            )
+            for number, name in self.declared
+            if (stderr := known[name].stderr)
+        )
+
+    def refit(self, records: Sequence[Record]) -> "Refitted | None":
+        """Fit the model again to other records; None if that fails."""
+        problem = self.problem.rebuild(records=records, weights=self.problem.output_weights)
+        (end,) = refine_candidates(problem, [self.theta], _REFIT_STEPS * (self.theta.size + 1))
+        if end is None:
+            return None
+        sensitivities = compute_sensitivities(problem, end.theta)
+        self.spent.extend([1] * (end.evaluations + sensitivities.evaluations))
+        fit = ResidualModel(-sensitivities.residuals, sensitivities.columns, self.parts).without
+        scale = compute_physical_scale(problem, end.theta)
+        values = end.theta + fit.coefficients * scale
+        known = {estimate.name: estimate for estimate in self.analysis.estimates}
+        moves = _order_moves(
+            Move(
+                name,
+                float(values[number]),
+                float(fit.errors[number] * scale[number]),
+                float(values[number] - self.theta[number]) / stderr,
+            )
+            for number, name in self.declared
+            if (stderr := known[name].stderr)
+        )
+        return Refitted(fit.criterion, moves)
+
+    def refit_parts(self, moment: float) -> "Parted | None":
+        """Fit the model to both parts of a record by themselves; None if that fails.
+
+        Both have parameters of their own, and the states may jump between them (Chow, Econometrica
+        28 (1960) 591). Moves are those to the value that is further away.
+        """
+        is_late = self.times >= moment
+        d, n = self.theta.size, self.times.size
+        if len(self.problem.records) > 1 or min(is_late.sum(), (~is_late).sum()) < 4 * d:
+            return None
+        points, columns, residuals = [], [], np.zeros(n)
+        for is_part in (~is_late, is_late):
+            problem = self._leave_out(~is_part)
+            (end,) = refine_candidates(problem, [self.theta], _REFIT_STEPS * (d + 1))
+            if end is None:
+                return None
+            slopes = compute_sensitivities(self.problem, end.theta)
+            self.spent.extend([1] * (end.evaluations + slopes.evaluations))
+            residuals[is_part] = -slopes.residuals[is_part]
+            columns.append(np.where(is_part[:, None], slopes.columns, 0.0))
+            points.append(end.theta)
+        jumps = [self.shift_start(one, int(np.argmax(is_late))) for one in self.start_slopes]
+        design = np.column_stack([*columns, *jumps])
+        fit = ResidualModel(residuals, design, self.parts).without
+        used = design.shape[1] - d + 1
+        scales = [compute_physical_scale(self.problem, point) for point in points]
+        values = [
+            point + fit.coefficients[k * d : (k + 1) * d] * scales[k]
+            for k, point in enumerate(points)
+        ]
+        errors = [fit.errors[k * d : (k + 1) * d] * scales[k] for k in range(2)]
+        known = {estimate.name: estimate for estimate in self.analysis.estimates}
+        moves, changes = [], []
         for number, name in self.declared:
             stderr = known[name].stderr
-            if stderr:
-                step = float(steps[number])
-                moves.append(
-                    Move(
-                        name,
-                        float(self.theta[number]) + step,
-                        float(errors[number]),
-                        step / stderr,
-                    )
-                )
-        return tuple(sorted(moves, key=lambda move: -abs(move.stderrs)))
+            if not stderr:
+                continue
+            away = [float(value[number] - self.theta[number]) / stderr for value in values]
+            far = int(np.argmax(np.abs(away)))
+            value, error = float(values[far][number]), float(errors[far][number])
+            moves.append(Move(name, value, error, away[far]))
+            change = float(values[1][number] - values[0][number])
+            size = abs(change) / max(float(np.hypot(*(e[number] for e in errors))), 1e-300)
+            changes.append((size, name, float(values[0][number]), float(values[1][number])))
+        criterion = fit.criterion + used * np.log(max(n, 2))
+        return Parted(criterion, _order_moves(moves), tuple(sorted(changes, reverse=True)))
 
-    def simulate(self, records: Sequence[Record]) -> FloatArray:
-        """Simulate the scored values (n,) with other inputs."""
-        return self._predict(
-            self.problem.rebuild(records=records, weights=self.problem.output_weights)
-        )
+    def _leave_out(self, rows: BoolArray) -> Problem:
+        """Leave scored samples (n,) out of the residuals of least squares."""
+        weight = self.problem.evaluator.weight.copy()
+        weight[self.problem.scored_rows[rows]] = 0.0
+        return replace(self.problem, evaluator=self.problem.evaluator._replace(weight=weight))
+
+    @cached_property
+    def start_slopes(self) -> list[FloatArray]:
+        """Slopes (n,) of the outputs in the start of each state, estimated or not."""
+        declared = {number for number, _ in self.declared}
+        columns = self.residual_model.columns
+        own = [columns[:, d] for d in range(self.theta.size) if d not in declared]
+        own += [np.sum(slopes, axis=1) for slopes in self.fixed_start_slopes]
+        return [column for column in own if column.any()]
+
+    def shift_start(self, slope: FloatArray, position: int) -> FloatArray:
+        """Let the effect (n,) of a start begin at a sample: that of a jump of the state there."""
+        part = next(p for p in self.parts if p.rows.start <= position < p.rows.stop)
+        shifted = np.zeros(slope.size)
+        length = part.rows.stop - position
+        shifted[position : part.rows.stop] = slope[part.rows][:length]
+        return shifted
+
+    def simulate(
+        self, records: Sequence[Record] | None = None, model: Model | None = None
+    ) -> FloatArray:
+        """Simulate the scored values (n,) with other inputs or another model."""
+        weights = self.problem.output_weights
+        return self._predict(self.problem.rebuild(records=records, model=model, weights=weights))
 
     def replace_input(
         self, name: str, change: Callable[[FloatArray], FloatArray], **fields: object
@@ -175,6 +299,24 @@ class ResidualContext:
         return records
 
     @cached_property
+    def fixed_start_slopes(self) -> list[FloatArray]:
+        """Slopes (n, E) of the outputs in each start that is not estimated; none if they are many.
+
+        Not of predictions one step ahead, which forget their start.
+        """
+        states = list_assumed_starts(self.problem)
+        if self.problem.prediction != "simulation" or len(states) > _MOST_STATES:
+            return []
+        noise = float(np.sqrt(np.mean(np.square(self.residual_model.residuals))))
+        self.spent.extend([1] * 3 * len(states))
+        return [compute_start_slopes(self.problem, self.theta, one, noise) for one in states]
+
+    @cached_property
+    def inputs(self) -> list[str]:
+        """Names of the inputs of the model."""
+        return [signal.name for signal in self.problem.model.inputs]
+
+    @cached_property
     def moving_inputs(self) -> list[Channel]:
         """Inputs of the model that move, as they are in the first record in which they do."""
         names = {signal.name for signal in self.problem.model.inputs}
@@ -184,6 +326,22 @@ class ResidualContext:
                 if channel.name in names and np.ptp(channel.values) > 0:
                     found.setdefault(channel.name, channel)
         return list(found.values())
+
+    def read_input(self, name: str, lag: float = 0.0) -> FloatArray:
+        """Read an input at the times (n,) of the samples, `lag` periods before.
+
+        A held input is read after its jump.
+        """
+        values = np.zeros(self.times.size)
+        for part in self.parts:
+            period = float(np.ptp(part.times)) / max(part.times.size - 1, 1)
+            for channel in self.problem.records[part.experiment].inputs:
+                if channel.name == name:
+                    after = _AFTER if channel.effective_hold == "zero" else 0.0
+                    values[part.rows] = interpolate_channel(
+                        channel, part.times + (after - lag) * period
+                    )
+        return values
 
     def find_breaks(self, column: FloatArray) -> list[tuple[float, FloatArray, str]]:
         """Find where a column (n,) most likely begins to count, under white and coloured noise.
@@ -209,6 +367,11 @@ class ResidualContext:
                 moment = float(self.times[self._order[best]])
                 found[best] = (moment, late, self._describe_moment(best, moment))
         return list(found.values())
+
+    def find_shocks(self) -> list[int]:
+        """Find the largest innovations, as numbers of samples."""
+        sizes = np.abs(self.residual_model.without.innovations)
+        return np.argsort(-sizes)[:_SHOCKS].tolist()
 
     def _describe_moment(self, position: int, moment: float) -> str:
         experiment = int(self._experiments[self._order[position]])
@@ -275,6 +438,28 @@ class ResidualContext:
                     rows[part.rows] = True
             if rows.any():
                 yield output.name, rows, format_unit(output.unit)
+
+
+class Refitted(NamedTuple):
+    """A model fitted again in full: Schwarz's criterion, and the moves of its parameters."""
+
+    criterion: float
+    moves: tuple[Move, ...]
+
+
+class Parted(NamedTuple):
+    """A model fitted to both parts of a record: criterion, moves, changes from part to part.
+
+    Changes are by size: in errors of the difference, the parameter, its values before and after.
+    """
+
+    criterion: float
+    moves: tuple[Move, ...]
+    changes: tuple[tuple[float, str, float, float], ...]
+
+
+def _order_moves(moves: Iterable[Move]) -> tuple[Move, ...]:
+    return tuple(sorted(moves, key=lambda move: -abs(move.stderrs)))
 
 
 def find_delay_parameters(problem: Problem) -> set[str]:

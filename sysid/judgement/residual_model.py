@@ -128,7 +128,7 @@ class ResidualModel:
         inverse = _invert_diagonal(products[:k, :k])
         used = columns.shape[1] + counted + sum(one.weights.size for one in noise)
         return ColumnFit(
-            twice + used * np.log(max(n, 2)),
+            float(twice + used * np.log(max(n, 2))),
             coefficients / scale,
             np.sqrt(np.maximum(inverse, 0.0) * spread) / scale,
             noise,
@@ -173,7 +173,7 @@ class ResidualModel:
 def _solve(products: FloatArray) -> FloatArray:
     """Solve normal equations (k + 1, k + 1) whose last column is the right-hand side."""
     k = products.shape[0] - 1
-    scale = np.sqrt(np.maximum(np.diag(products)[:k], np.finfo(float).tiny))
+    scale = _compute_lengths(products[:k, :k])
     matrix = products[:k, :k] / np.outer(scale, scale) + _RIDGE * np.eye(k)
     right = products[:k, k] / scale
     try:
@@ -184,6 +184,12 @@ def _solve(products: FloatArray) -> FloatArray:
 
 def _invert_diagonal(products: FloatArray) -> FloatArray:
     """Compute the diagonal (k,) of the inverse of normal equations (k, k)."""
-    scale = np.sqrt(np.maximum(np.diag(products), np.finfo(float).tiny))
+    scale = _compute_lengths(products)
     matrix = products / np.outer(scale, scale) + _RIDGE * np.eye(scale.size)
     return np.asarray(np.diag(np.linalg.pinv(matrix, hermitian=True)) / scale**2)
+
+
+def _compute_lengths(products: FloatArray) -> FloatArray:
+    """Compute the lengths (k,) of columns from their products (k, k); 1 of a column of zeros."""
+    powers = np.diag(products)
+    return np.sqrt(np.where(powers > 0, powers, 1.0))

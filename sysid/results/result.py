@@ -165,6 +165,9 @@ class Result:
         Free parameters that time lags depend on.
     findings : tuple of Finding
         What explains the residuals, and what speaks against the estimates; the most severe first.
+    explained : bool
+        Whether explanations of the residuals were looked for. In a sweep they are not, until a run
+        is opened.
     verdict : Verdict
         Whether the estimates can be relied on.
     warnings : tuple of str
@@ -204,6 +207,7 @@ class Result:
     order_comparison: OrderComparison | None
     delays: tuple[str, ...]
     findings: tuple[Finding, ...]
+    explained: bool
     verdict: Verdict
     warnings: tuple[str, ...]
     substeps: int

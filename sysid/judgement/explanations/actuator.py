@@ -6,14 +6,19 @@ takes away (errors in variables: Söderström, Automatica 43 (2007) 939).
 """
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
-from sysid.data.interpolation import interpolate_channel
 from sysid.judgement.residual_context import Candidate, ResidualContext
+from sysid.judgement.unrecorded_input import compute_reach
 from sysid.results.findings import Family
 
 _LIMITS = (0.5, 0.65, 0.8, 0.9, 0.96)  # of the span
@@ -21,7 +26,15 @@ _PLAYS = (0.03, 0.07, 0.15, 0.3)  # of the span
 _RATES = (0.01, 0.03, 0.1, 0.3)  # of the span, in a sample
 _WIDTHS = (3, 5, 9, 17)  # samples
 
-Change = Callable[[FloatArray], FloatArray]
+
+class _Change(NamedTuple):
+    """A change of the values (N,) of an input, with its words."""
+
+    apply: Callable[[FloatArray], FloatArray]
+    explanation: str
+    family: Family
+    brief: str
+    text: str
 
 
 def propose(context: ResidualContext) -> Iterator[Candidate]:
@@ -30,27 +43,28 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
         name = channel.name
         low, high = float(np.min(channel.values)), float(np.max(channel.values))
         span = high - low
-        for change, explanation, family, brief, text in _list_changes(name, low, high, span):
+        changes = list(_list_changes(name, low, high, span))
+        if channel.effective_hold != "zero":  # a command that is held has no noise
+            changes += _list_smoothings(name)
+        for change in changes:
+            records = context.replace_input(name, change.apply)
             try:
-                other = context.simulate(context.replace_input(name, change))
+                other = context.simulate(records)
             except SysidError:
                 continue
             moved = other - context.simulated
             if np.all(np.isfinite(moved)) and np.any(moved != 0):
                 yield Candidate(
-                    explanation,
-                    family,
+                    change.explanation,
+                    change.family,
                     context.weigh(moved),
-                    brief,
-                    text,
+                    change.brief,
+                    change.text,
                     counted=1,
+                    records=records,
+                    is_vague=change.family == "input",
                 )
-        direct = np.zeros(context.times.size)
-        for part in context.parts:
-            record = context.problem.records[part.experiment]
-            for own in record.inputs:
-                if own.name == name:
-                    direct[part.rows] = interpolate_channel(own, part.times)
+        direct = context.read_input(name)
         yield Candidate(
             "direct path",
             "sensor",
@@ -61,9 +75,46 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
         )
 
 
-def _list_changes(
-    name: str, low: float, high: float, span: float
-) -> Iterator[tuple[Change, str, Family, str, str]]:
+def propose_loads(context: ResidualContext) -> Iterator[Candidate]:
+    """Propose a load that begins to act at the input of the plant where an innovation is large.
+
+    An input acts after its time lag, so the load began by so much earlier.
+    """
+    reach = compute_reach(context.problem, context.analysis)
+    for channel, position in product(context.moving_inputs[:1], context.find_shocks()):
+        begin = float(context.times[position]) - reach
+        records = [
+            replace(
+                record,
+                inputs=tuple(
+                    replace(
+                        one,
+                        values=one.values + np.where(one.times >= begin, np.ptp(one.values), 0.0),
+                        hold=one.effective_hold,
+                    )
+                    if one.name == channel.name
+                    else one
+                    for one in record.inputs
+                ),
+            )
+            for record in context.problem.records
+        ]
+        with suppress(SysidError):
+            moved = context.simulate(records) - context.simulated
+            if np.all(np.isfinite(moved)) and moved.any():
+                yield Candidate(
+                    "load",
+                    "input",
+                    context.weigh(moved),
+                    f"a load acts from about {begin:.4g} s on",
+                    f"from about {begin:.4g} s on a load acts on the plant beside {channel.name}, "
+                    "or another input",
+                    "Record the load as an input.",
+                    counted=1,
+                )
+
+
+def _list_changes(name: str, low: float, high: float, span: float) -> Iterator[_Change]:
     """List changes of an input (N,), with their words."""
     for share in _LIMITS:
         limit, brief = "limit of an actuator", f"{name} has a limit"
@@ -73,12 +124,12 @@ def _list_changes(
         )
         top, bottom = low + share * span, high - share * span
         clip_high = partial(np.minimum, top)
-        yield clip_high, limit, "actuator", brief, text.format("below", top)
+        yield _Change(clip_high, limit, "actuator", brief, text.format("below", top))
         clip_low = partial(np.maximum, bottom)
-        yield clip_low, limit, "actuator", brief, text.format("above", bottom)
+        yield _Change(clip_low, limit, "actuator", brief, text.format("above", bottom))
     middle = 0.5 * (low + high)
     for power, word in ((2, "the square"), (3, "the cube")):
-        yield (
+        yield _Change(
             partial(_bend, middle=middle, span=span, power=power),
             "curve of an actuator",
             "actuator",
@@ -86,14 +137,14 @@ def _list_changes(
             f"the plant follows {name} along a curve, about {word} of it: a nonlinear actuator",
         )
     for share in _PLAYS:
-        yield (
+        yield _Change(
             partial(_play, width=share * span),
             "backlash",
             "actuator",
             f"{name} has backlash",
             f"what acts on the plant follows {name} with a play of about {2 * share * span:.3g}",
         )
-        yield (
+        yield _Change(
             partial(_ignore_small, middle=middle, width=share * span),
             "dead zone",
             "actuator",
@@ -101,16 +152,19 @@ def _list_changes(
             f"Small values of {name} do not act on the plant",
         )
     for share in _RATES:
-        yield (
+        yield _Change(
             partial(_limit_rate, most=share * span),
             "limit of the rate",
             "actuator",
             f"{name} has a limit of its rate",
             f"what acts on the plant follows {name} at most by {share * span:.3g} in a sample",
         )
-    for width in _WIDTHS:
-        yield (
-            partial(_smooth, width=width),
+
+
+def _list_smoothings(name: str) -> Iterator[_Change]:
+    for width, smooth in product(_WIDTHS, (_smooth, _take_medians, _keep_edges)):
+        yield _Change(
+            partial(smooth, width=width),
             "noise of an input",
             "input",
             f"{name} was recorded with noise",
@@ -148,3 +202,21 @@ def _limit_rate(values: FloatArray, most: float) -> FloatArray:
 def _smooth(values: FloatArray, width: int) -> FloatArray:
     padded = np.pad(values, width // 2, mode="edge")
     return np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
+
+
+def _take_medians(values: FloatArray, width: int) -> FloatArray:
+    """Take the median of each value's neighbours: noise goes, and jumps stay (Tukey 1977)."""
+    padded = np.pad(values, width // 2, mode="edge")
+    return np.asarray(np.median(sliding_window_view(padded, width), axis=1))
+
+
+def _keep_edges(values: FloatArray, width: int) -> FloatArray:
+    """Average each value with neighbours that differ by little (bilateral: Tomasi, Manduchi 1998).
+
+    Little is a few deviations of the differences between neighbours.
+    """
+    deviation = 1.4826 * float(np.median(np.abs(np.diff(values)))) / np.sqrt(2.0)
+    padded = np.pad(values, width // 2, mode="edge")
+    windows = sliding_window_view(padded, width)
+    weights = np.exp(-0.5 * ((windows - values[:, None]) / max(3.0 * deviation, 1e-300)) ** 2)
+    return np.asarray(np.sum(weights * windows, axis=1) / np.sum(weights, axis=1))

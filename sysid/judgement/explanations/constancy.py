@@ -26,14 +26,14 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
     is_lag_a_clock = False
     for number, name in context.declared:
         column = model.columns[:, number]
-        if not column.any():
-            continue
+        if not column.any() or _are_alike(column, context.weight):
+            continue  # an offset of the output: a step or a drift of the sensor
         is_lag = name in context.delays
         is_clock = is_lag and _are_alike(column, clock)
         is_lag_a_clock |= is_clock
         subject = f"{name}, or the offset between the clocks," if is_clock else name
         explanation = "change of a time lag" if is_lag else "change of a parameter"
-        for _, late, moment in context.find_breaks(column):
+        for at, late, moment in context.find_breaks(column):
             yield Candidate(
                 explanation,
                 "constancy",
@@ -43,18 +43,32 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 "Identify both parts by themselves: give each a label in a column for --segments.",
                 counted=1,
                 describe=_describe_change(context, number, float(scale[number])),
+                varies=(number, 0.0, 1.0),
+                moment=at,
             )
-        explanation = "drift of a time lag" if is_lag else "drift of a parameter"
         yield Candidate(
-            explanation,
+            "drift of a time lag" if is_lag else "drift of a parameter",
             "constancy",
             (column * share)[:, None],
             f"{name} drifts",
             f"{subject} drifts over the record",
             describe=_describe_drift(context, number, float(scale[number])),
+            varies=(number, -0.5, 0.5),
         )
+        for signal, values in _list_signals(context):
+            yield Candidate(
+                f"{explanation} with a signal",
+                "constancy",
+                (column * values)[:, None],
+                f"{name} follows {signal}",
+                f"{subject} is no constant: it follows {signal}",
+                f"Write how {name} depends on {signal} in the model's document.",
+                counted=1,
+                describe=_describe_drift(context, number, float(scale[number])),
+                varies=(number, -0.5, 0.5),
+            )
     if not is_lag_a_clock:
-        for _, late, moment in context.find_breaks(clock):
+        for at, late, moment in context.find_breaks(clock):
             yield Candidate(
                 "jump of a clock",
                 "clocks",
@@ -64,6 +78,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 "rows are missing",
                 "Look for lost rows there, and identify both parts by themselves.",
                 counted=1,
+                moment=at,
             )
         yield Candidate(
             "drift of a clock",
@@ -73,6 +88,20 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             "the clocks of input and output drift apart",
             "Put both channels on one clock.",
         )
+
+
+def _list_signals(context: ResidualContext) -> Iterator[tuple[str, FloatArray]]:
+    """List the outputs and inputs (n,) that a parameter may follow, from about -0.5 to 0.5."""
+    for name, rows, _ in context.iterate_outputs():
+        values = np.where(rows, context.simulated, 0.0)
+        span = float(np.ptp(context.simulated[rows]))
+        if span > 0:
+            yield name, np.where(rows, (values - np.mean(context.simulated[rows])) / span, 0.0)
+    for channel in context.moving_inputs:
+        values = context.read_input(channel.name)
+        span = float(np.ptp(values))
+        if span > 0:
+            yield channel.name, (values - np.mean(values)) / span
 
 
 def _centre_times(context: ResidualContext) -> FloatArray:

@@ -15,11 +15,10 @@ import numpy as np
 from sysid.core.errors import SysidError
 from sysid.data.records import Channel, History, Record
 from sysid.judgement.residual_context import Candidate, ResidualContext
-from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
+from sysid.judgement.start_slopes import list_assumed_starts
 from sysid.judgement.unrecorded_input import compute_reach
 
 _SPANS = 4  # of the time that lags reach back before the record
-_MOST_STATES = 8
 
 
 def propose(context: ResidualContext) -> Iterator[Candidate]:
@@ -28,10 +27,9 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
     if problem.prediction != "simulation":
         return
     yield from _propose_inputs(context)
-    states = list_assumed_starts(problem)
-    if 0 < len(states) <= _MOST_STATES:
-        noise = float(np.sqrt(np.mean(np.square(context.residual_model.residuals))))
-        slopes = [compute_start_slopes(problem, context.theta, name, noise) for name in states]
+    yield from _propose_restarts(context)
+    states, slopes = list_assumed_starts(problem), context.fixed_start_slopes
+    if slopes:
         yield Candidate(
             "start",
             "start",
@@ -42,14 +40,41 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
         )
 
 
+def _propose_restarts(context: ResidualContext) -> Iterator[Candidate]:
+    """Propose that the states jump during the record: a pulse of a load, or two records in one.
+
+    The effect of a start, begun later, is that of a jump of the states there (innovational outlier:
+    Chen and Liu, J. Am. Stat. Assoc. 88 (1993) 284).
+    """
+    sources = context.start_slopes
+    if not sources or len(context.parts) != len(context.problem.records):
+        return  # of one output only
+    for position in context.find_shocks():
+        columns = [context.shift_start(source, position) for source in sources]
+        moved = [column for column in columns if column.any()]
+        if moved and position > 0:
+            moment = float(context.times[position])
+            yield Candidate(
+                "jump of the states",
+                "record",
+                np.column_stack(moved),
+                f"the plant jumps at about {moment:.4g} s",
+                f"at about {moment:.4g} s the plant is elsewhere at once: by a pulse of a load, "
+                "rows that are missing, or two records in one",
+                "Identify both parts by themselves: give each a label in a column for --segments.",
+                counted=1,
+                moment=moment,
+            )
+
+
 def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:
     """Propose that an input was elsewhere before its first sample."""
     reach = compute_reach(context.problem, context.analysis)
-    for channel in context.moving_inputs if reach > 0 else ():
+    for name in context.inputs if reach > 0 else ():
         columns = []
         for span in range(_SPANS):
             with suppress(SysidError):
-                other = context.simulate(_change_history(context, channel.name, reach, span))
+                other = context.simulate(_change_history(context, name, reach, span))
                 columns.append(other - context.simulated)
         moved = [column for column in columns if np.all(np.isfinite(column)) and column.any()]
         if moved:
@@ -57,8 +82,8 @@ def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:
                 "input before the record",
                 "history",
                 context.weigh(np.column_stack(moved)),
-                f"{channel.name} moved before the record",
-                f"{channel.name} was not at its first value before the record, as is assumed",
+                f"{name} moved before the record",
+                f"{name} was not at its first value before the record, as is assumed",
                 "Begin the record earlier, or leave its first samples out with skip.",
             )
 
@@ -81,7 +106,7 @@ def _prepend(channel: Channel, reach: float, span: int) -> Channel:
     known = channel.history
     first = float(channel.times[0] if known is None else known.times[0])
     value = float(channel.values[0] if known is None else known.values[0])
-    move = float(np.ptp(channel.values)) or 1.0
+    move = float(np.ptp(channel.values)) or abs(value) or 1.0
     width = reach / _SPANS
     begin = first - (span + 1) * width
     times = np.array([begin - width, begin - 1e-6 * width, begin, begin + width * (1 - 1e-6)])

@@ -32,17 +32,24 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 _shift_back,
                 "is the mean of the period that ends at its stamp",
             ),
+            "as lines between its changes": (
+                "first",
+                _join_changes,
+                "runs in straight lines from one change to the next",
+            ),
         }
         for word, (hold, change, text) in others.items():
             if change is _keep and hold == channel.effective_hold:
                 continue
+            records = context.replace_input(name, change, hold=hold)
             try:
-                other = context.simulate(context.replace_input(name, change, hold=hold))
+                other = context.simulate(records)
             except SysidError:
                 continue
             moved = other - context.simulated
             if np.all(np.isfinite(moved)) and moved.any():
-                setting = f"Use hold: {{{name}: {hold}}}." if change is _keep else ""
+                is_sure = change is _keep and channel.sampling.is_regular
+                setting = f"Use hold: {{{name}: {hold}}}." if is_sure else ""
                 yield Candidate(
                     "reading of an input",
                     "reading",
@@ -50,6 +57,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                     f"{name} is better read {word}",
                     f"the data say that {name} {text}",
                     setting,
+                    records=records,
                 )
     yield from _propose_means(context)
 
@@ -112,3 +120,9 @@ def _keep(values: FloatArray) -> FloatArray:
 def _shift_back(values: FloatArray) -> FloatArray:
     """Let each value count from the sample before it on."""
     return np.append(values[1:], values[-1])
+
+
+def _join_changes(values: FloatArray) -> FloatArray:
+    """Join the values at which a held signal changes by straight lines."""
+    changes = np.flatnonzero(np.diff(values, prepend=np.nan) != 0)
+    return np.interp(np.arange(values.size), changes, values[changes])

@@ -10,10 +10,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from sysid.core.types import FloatArray
-from sysid.data.interpolation import interpolate_channel
 from sysid.judgement.residual_context import Candidate, ResidualContext
 
-_PARTS = (1.0, 3.0, 10.0)  # time constants of the new part, in samples
+_PARTS = (1.0, 3.0, 10.0, 30.0, 100.0)  # time constants of the new part, in samples
 _LAGS = 12  # past values of each input, denser towards the present, over a quarter of the record
 
 
@@ -32,6 +31,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             "a time constant is missing from the model",
             "Use a model of one order more.",
             counted=1,
+            is_vague=True,
         )
     yield Candidate(
         "zero of the response",
@@ -39,7 +39,8 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
         context.weigh(np.column_stack([context.slope, _differentiate(context)])),
         "the beginning of the response is missing",
         "the response begins otherwise than the model's, as with a zero or an inverse response",
-        "Give the model a lead time: a zero beside its time constants.",
+        "Add a lead time (a zero) to the model.",
+        is_vague=True,
     )
     columns = list(_list_past_inputs(context))
     if columns:
@@ -50,6 +51,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             "a part of the response is missing",
             "the residuals follow the inputs: a part of the response is missing from the model",
             "Try a model of another structure.",
+            is_vague=True,
         )
         squares = [np.square(column) - np.mean(np.square(column)) for column in columns[::2]]
         yield Candidate(
@@ -59,6 +61,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             "a nonlinear part of the response is missing",
             "the residuals follow squares of the inputs: the plant is less linear than the model",
             "Try a nonlinear model.",
+            is_vague=True,
         )
 
 
@@ -83,12 +86,6 @@ def _list_past_inputs(context: ResidualContext) -> Iterator[FloatArray]:
     lags = np.unique(np.geomspace(1.0, max(longest / 4, 1.0), _LAGS).astype(np.int64)) - 1
     for channel in context.moving_inputs:
         for lag in lags.tolist():
-            column = np.zeros(context.times.size)
-            for part in context.parts:
-                record = context.problem.records[part.experiment]
-                period = float(np.ptp(part.times)) / max(part.times.size - 1, 1)
-                for own in record.inputs:
-                    if own.name == channel.name:
-                        column[part.rows] = interpolate_channel(own, part.times - lag * period)
+            column = context.read_input(channel.name, lag)
             if np.ptp(column) > 0:
                 yield column - np.mean(column)

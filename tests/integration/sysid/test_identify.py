@@ -123,7 +123,7 @@ def test_a_model_worse_than_a_straight_line_is_told() -> None:
 
 def test_an_estimate_at_its_bound_is_told() -> None:
     found = identify(DUFFING_MODEL, record(noisy()), parameters={"a": {"lower": 1.5, "upper": 5.0}})
-    assert any(w == "a lies at its lower bound 1.5 N/m³" for w in found.warnings)
+    assert any(w.startswith("a lies at its lower bound 1.5 N/m³.") for w in found.warnings)
 
 
 def test_a_bound_that_is_to_be_widened_is_told_once() -> None:
@@ -132,7 +132,8 @@ def test_a_bound_that_is_to_be_widened_is_told_once() -> None:
     )
     assert found["c"].status == "at bound"
     [note] = [w for w in found.warnings if w.startswith(("c is at its", "c lies at its"))]
-    assert note.startswith("c is at its lower bound 5 N·s/m. To widen: ")
+    assert note.startswith("c is at its lower bound 5 N·s/m and L lies at its lower bound 0 s. ")
+    assert note.endswith("To widen: lower the bound of c, unless it is a physical limit.")
 
 
 def test_progress_is_told_and_ends_at_the_result() -> None:

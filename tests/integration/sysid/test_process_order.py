@@ -3,7 +3,6 @@
 Records come from exact responses of first-order parts to held inputs.
 """
 
-from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -14,12 +13,12 @@ from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
-from sysid.judgement.process_order import mark_order_dependent, warn_other_order
+from sysid.judgement.process_order import find_other_orders
+from sysid.results.findings import Finding
 from sysid.results.identification import Identification
 from sysid.results.parts import OrderComparison, OrderFit, compare_fits
 from sysid.results.summary import describe_order
-from sysid.uncertainty.analysis import Analysis
-from sysid.uncertainty.estimates import Criteria, Estimate, NoiseColour, Uncertainty
+from sysid.uncertainty.estimates import Estimate
 
 PERIOD, COUNT, FINE = 0.2, 300, 50
 QUICK = GeneticAlgorithm(generations=60)
@@ -76,7 +75,7 @@ def compare(found: Identification) -> OrderComparison:
 
 
 def find_order_warnings(found: Identification) -> list[str]:
-    return [text for text in found.warnings if "prefer" in text or "depends on the order" in text]
+    return [one.sentences for one in found.findings if one.explanation == "order"]
 
 
 @pytest.fixture(scope="module")
@@ -97,16 +96,18 @@ def test_a_missing_time_constant_is_told_with_the_dead_time_of_the_other_order(
     assert second.delay_stderr is not None
     assert abs(second.delay - 1.33) < 3 * second.delay_stderr
     assert found.delay_range == (second.delay, second.delay)
-    assert missing["L"].status == "order-dependent"
+    assert missing["L"].status == "dependent"
     value = f"{second.delay:.4f} ± {second.delay_stderr:.4f} s"
-    assert missing["L"].reason == f"it is {value} with sopdt, which the data prefer"
+    assert f"it is {value} if the data prefer sopdt" in missing["L"].reason
     assert missing["K"].status == "identified"
-    assert missing.verdict.text == "trustworthy, but L depends on the model's order"
+    assert missing.verdict.text.startswith("trustworthy but for L")
+    assert "the data prefer sopdt" in missing.verdict.text
     assert second.values["r"] * second.values["T1"] == pytest.approx(0.3, abs=0.05)
     [warning] = find_order_warnings(missing)
     assert warning.startswith("the data prefer sopdt (order 2) to fopdt (order 1): its BIC is ")
-    assert f"L is {second.delay:.2f}" in warning
-    assert warning.endswith(" with fopdt. Use the model sopdt")
+    assert f", {value} with sopdt." in warning
+    assert f"L is {found.own_fit.delay:.3f} ± " in warning
+    assert warning.endswith(" Use the model sopdt.")
     assert describe_order(found) in repr(missing)
 
 
@@ -139,8 +140,9 @@ def test_an_own_model_is_compared_under_its_own_names_and_keeps_what_it_fixes() 
     assert (compared.model, compared.preferred_model, compared.delay) == ("fopdt", "sopdt", "lag")
     assert all(fit.values["y0"] == 0.0 for fit in compared.fits)  # the model has no offset
     [warning] = find_order_warnings(found)
-    assert "lag is 1.3" in warning
-    assert warning.endswith("Give your model as many time constants, or use the model sopdt")
+    assert "lag is 1.5" in warning
+    assert ", 1.33" in warning
+    assert warning.endswith("Give your model as many time constants, or use the model sopdt.")
 
 
 def test_a_fixed_gain_stays_fixed() -> None:
@@ -189,17 +191,18 @@ def test_orders_are_not_compared_where_the_dead_time_is_at_its_bound() -> None:
     assert limited["L"].status == "at bound"
     assert limited.order_comparison is None
     assert find_order_warnings(limited) == []
-    assert limited.verdict.reasons[0].brief == "L lies at its bound"
-    assert not any("order" in reason.text for reason in limited.verdict.reasons)
-    [coloured] = [text for text in limited.warnings if "not white" in text]
-    assert coloured.startswith(
-        "the residuals are not white (on the estimation data). The bound of L may be the cause. "
-    )
+    first = limited.findings[0]
+    assert (first.explanation, first.severity) == ("bound", "serious")
+    assert "not noise, which the bound may cause" in first.text
+    assert "L lies at its bound" in limited.verdict.text
     near = identify(  # L of the first order lies inside, that of the second at the bound
         "fopdt", make_record(1.5, 0.3), QUICK, parameters={"L": {"lower": 1.45, "upper": 5}}
     )
-    assert near["L"].status not in ("at bound", "order-dependent")
     assert near.order_comparison is None
+    assert find_order_warnings(near) == []
+    # What is missing is found without the fit of another order.
+    assert near["L"].status == "dependent"
+    assert near["L"].reason.endswith("if a time constant is missing")
 
 
 def write_fits(*bics: float) -> OrderComparison:
@@ -212,13 +215,11 @@ def write_fits(*bics: float) -> OrderComparison:
     return compare_fits("sopdt", "L", "s", "white", fits, 300)
 
 
-def analyse(estimate: Estimate, colour: NoiseColour = "white") -> Analysis:
-    """An analysis with one estimate under noise of this colour."""
-    nothing = np.zeros((1, 1))
-    uncertainty = Uncertainty(
-        ("L",), nothing, nothing, nothing, 1.0, np.ones(1), 0.0, noise_colour=colour
-    )
-    return Analysis((estimate,), uncertainty, 0.0, 0, Criteria(0.0, 0.0, 0.0, 9, 1))
+LAG = Estimate("L", "s", 1.4, 0.0, 5.0, 0.01, (1.38, 1.42), "identified")
+
+
+def list_findings(*bics: float, model: str = "sopdt") -> list[Finding]:
+    return list(find_other_orders(write_fits(*bics), model, [LAG]))
 
 
 def test_orders_within_six_of_the_lowest_criterion_are_open() -> None:
@@ -226,24 +227,8 @@ def test_orders_within_six_of_the_lowest_criterion_are_open() -> None:
     assert [fit.model for fit in open_orders.open_fits] == ["sopdt", "topdt"]
     assert open_orders.preferred_model is None
     assert open_orders.delay_range == (1.3, 1.4)
-    [text] = warn_other_order(open_orders, "sopdt")
-    assert text == (
-        "L depends on the order of the model, which the data do not tell: 1.400 ± 0.010 s with "
-        "sopdt, 1.300 ± 0.010 s with topdt. Its standard error assumes that the order is right"
-    )
     assert write_fits(16.1, 10.0, 16.1).preferred_model == "sopdt"
-    assert warn_other_order(write_fits(16.1, 10.0, 16.1), "sopdt") == []
     assert write_fits(10.0, 16.1, 30.0).preferred_model == "fopdt"
-    assert warn_other_order(None, "sopdt") == []
-    lag = Estimate("L", "s", 1.4, 0.0, 5.0, 0.05, (1.3, 1.5), "identified")
-    wide = replace(lag, interval95=(1.2, 1.58))
-    at_bound = replace(lag, status="at bound")
-    prefers_first = write_fits(10.0, 16.1, 30.0)
-    for one, orders in ((lag, open_orders), (wide, prefers_first), (at_bound, prefers_first)):
-        assert mark_order_dependent(analyse(one), orders) == (one,)
-    [marked] = mark_order_dependent(analyse(lag), prefers_first)
-    assert marked.status == "order-dependent"
-    assert mark_order_dependent(analyse(lag, "clustered"), prefers_first) == (lag,)
     assert describe_order(write_fits(16.1, 10.0, 16.1)) == (
         "order: the data prefer sopdt to fopdt and topdt; L is 1.400 ± 0.010 s with sopdt"
     )
@@ -251,6 +236,40 @@ def test_orders_within_six_of_the_lowest_criterion_are_open() -> None:
         "order: the data do not tell fopdt and sopdt apart; L is 1.570 ± 0.010 s with fopdt, "
         "1.400 ± 0.010 s with sopdt"
     )
+
+
+def test_an_open_order_that_moves_the_lag_makes_it_dependent() -> None:
+    [found] = list_findings(16.1, 10.0, 16.0)
+    assert (found.severity, found.parameters, found.status) == ("caution", ("L",), "dependent")
+    assert found.brief == "the data do not tell sopdt and topdt apart"
+    assert "L is 1.400 ± 0.010 s with sopdt, 1.300 ± 0.010 s with topdt" in found.text
+    assert found.advice == ""
+    [move] = found.moves
+    assert (move.parameter, move.value, move.stderrs) == ("L", 1.3, pytest.approx(-10.0))
+
+
+def test_a_preferred_order_has_its_gain_its_lag_and_its_name_as_advice() -> None:
+    [found] = list_findings(10.0, 16.5, 30.0)
+    assert found.gain == pytest.approx(6.5)
+    assert found.brief == "the data prefer fopdt"
+    assert found.advice == "Use the model fopdt."
+    assert found.moves[0].value == 1.57
+    [other] = list_findings(10.0, 16.5, 30.0, model="vessel")
+    assert other.advice == "Give your model as many time constants, or use the model fopdt."
+
+
+def test_the_model_s_own_order_is_no_finding() -> None:
+    assert list_findings(16.1, 10.0, 16.1) == []
+    assert list(find_other_orders(None, "sopdt", [LAG])) == []
+
+
+def test_a_preferred_order_that_moves_nothing_is_a_note() -> None:
+    fits = [
+        OrderFit("fopdt", 1, 1.41, 0.01, {}, 0.02, 10.0),
+        OrderFit("sopdt", 2, 1.4, 0.01, {}, 0.02, 30.0),
+    ]
+    [found] = find_other_orders(compare_fits("sopdt", "L", "s", "white", fits), "sopdt", [LAG])
+    assert (found.severity, found.parameters, found.moves) == ("note", (), ())
 
 
 def test_a_noisy_record_beside_a_quiet_one_does_not_blur_the_comparison() -> None:

@@ -185,14 +185,15 @@ def test_a_part_that_hardly_moves_has_an_rms_and_no_fit() -> None:
     assert f"their standard deviation is {spread:.3g}, " in note
 
 
-def test_a_model_that_predicts_worse_than_the_mean_is_not_validated() -> None:
+def test_a_model_that_predicts_worse_than_the_mean_is_refuted() -> None:
     found, spread = identify_heater(1.0, -1.0)
     assert found.fit_percent.estimation > 95
     assert found.rms_validation is not None
     assert found.rms_validation > spread
-    assert {one.status for one in found.parameters} == {"not validated"}
+    assert {one.status for one in found.parameters} == {"refuted"}
     assert "the model predicts the validation data worse than their mean" in found.warnings[0]
     assert f"RMS {found.rms_validation:.3g} against {spread:.3g}, " in found.warnings[0]
+    assert found.verdict.text.startswith("not trustworthy: the validation data contradict")
 
 
 def test_a_part_that_moves_less_than_the_rest_keeps_its_fit() -> None:

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sysid.judgement.warnings import _warn_correlations
 
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
+from sysid.judgement.determination import find_undetermined
 from sysid.models.catalogue.load import load_model
 from sysid.results.identification import Identification
 from sysid.simulation.problem import Problem
@@ -93,18 +93,25 @@ def test_a_lag_that_may_as_well_be_zero_is_not_separable_from_what_it_is_on_a_ri
     problem = Problem.build(FOPDT, [driven("u", TIMES / 6, 0.0 * TIMES)], parameters=sought)
     y = problem.predict(np.array([[0.2, 0.05]]))[0] + draw_noise(0.02)
     found = identify(FOPDT, driven("u", TIMES / 6, y), parameters=sought)
-    assert is_warned(found, "T and L not separable")
+    assert is_warned(found, "T and L are not separable")
     # Coloured residuals may turn the ellipsoid; what one sensitivity makes up for in another stays.
     problem = Problem.build(FOPDT, [driven("u", TIMES / 6, y)], parameters=sought)
     theta = np.array([found[name].value for name in problem.free_names])
-    uncertainty = analyse_estimate(problem, theta).uncertainty
+    analysis = replace(analyse_estimate(problem, theta), estimates=found.parameters)
+    uncertainty = analysis.uncertainty
     assert uncertainty is not None
-    turned = replace(uncertainty, correlation=np.array([[1.0, 0.5], [0.5, 1.0]]))
-    [ridge] = _warn_correlations(turned, found.parameters, {"L"})
-    r = uncertainty.sensitivity_correlation[0, 1]
-    assert f"not separable (correlation 0.500, {r:.3f} if the residuals were white)" in ridge
-    apart = replace(turned, sensitivity_correlation=turned.correlation)
-    assert _warn_correlations(apart, found.parameters, {"L"}) == []
-    strong = replace(turned, correlation=np.array([[1.0, 0.98], [0.98, 1.0]]))
-    [text] = _warn_correlations(strong, found.parameters, set())
-    assert text.startswith("T and L have the correlation 0.980: ")  # `r` is a parameter of sopdt
+
+    def list_ridges(r: float, alike: float) -> list[str]:
+        turned = replace(
+            uncertainty,
+            correlation=np.array([[1.0, r], [r, 1.0]]),
+            sensitivity_correlation=np.array([[1.0, alike], [alike, 1.0]]),
+        )
+        turned_analysis = replace(analysis, uncertainty=turned)
+        listed = find_undetermined(problem, turned_analysis, {"L"}, are_residuals_noise=True)
+        return [one.text for one in listed if one.explanation == "ridge"]
+
+    alike = float(uncertainty.sensitivity_correlation[0, 1])
+    [ridge] = list_ridges(0.5, alike)
+    assert "T and L are not separable (correlation 0.500)" in ridge
+    assert list_ridges(0.5, 0.5) == []
