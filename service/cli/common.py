@@ -246,13 +246,13 @@ def _advise_start(state: str, fields: Sequence[str], value: str) -> str:
     document = "write it into the model's document, which lagid models show prints"
     given = parse_yaml(value.encode())
     if not fields and not isinstance(given, int | float | Mapping):
-        return f"no option sets how a state starts; {document}"
+        return f"no option sets how one state starts; {document}"
     if not fields and not isinstance(given, Mapping):
         fields = ["fixed"]
     wanted = ".".join(["parameters", f"{state.removesuffix('(0)')}(0)", *fields])
     return (
         f"a start value that is searched is a parameter: --set '{wanted}={value}'. If the model "
-        f"does not search it, {document}"
+        f"does not search it, add --set initial=free, or {document}"
     )
 
 

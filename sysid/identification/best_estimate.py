@@ -313,7 +313,7 @@ class _EstimateSearch:
         if self.starts is None:
             return False
         self._budget.spend(self.starts.evaluations)
-        best = self.starts.preferred
+        best = self.starts.best
         if best is self.starts.own or best.name in self._left:
             return False
         self._left.append(self.starts.own.name)
