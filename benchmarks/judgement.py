@@ -41,6 +41,7 @@ from sysid.core.text import rewrite_settings
 from sysid.identification.identify import identify_records
 from sysid.identification.identify_arguments import read_records
 from sysid.models.catalogue.load import resolve_model
+from sysid.results.findings import Finding
 
 SEEDS, QUICK = 10, 1
 FIRST_SEED = 71_000
@@ -173,7 +174,7 @@ def judge_case(task: tuple[str, int]) -> Answer:
 
 def _tell_answer(case: Case) -> dict[str, Any]:
     found = identify_as_command(case.model, case.recording)
-    findings = getattr(found, "findings", ())
+    findings = found.findings
     first = findings[0] if findings else None
     estimates = compare_truth(found, case)
     settings = read_advice(found)
@@ -208,7 +209,7 @@ def is_detectable(case: Case, found: Identification) -> bool:
     return bool(np.sum(missed**2) - free > 10.0 + 2.0 * np.log(missed.size))
 
 
-def _describe_finding(finding: Any) -> dict[str, Any]:
+def _describe_finding(finding: Finding) -> dict[str, Any]:
     moves = {move.parameter: [float(move.value), float(move.stderrs)] for move in finding.moves}
     return {
         "explanation": finding.explanation,
@@ -218,7 +219,7 @@ def _describe_finding(finding: Any) -> dict[str, Any]:
         "severity": finding.severity,
         "brief": finding.brief,
         "text": finding.text,
-        "advice": str(finding.advice or ""),
+        "advice": finding.advice,
     }
 
 

@@ -82,7 +82,9 @@ def count_verdicts(kind: Kind, draws: int) -> Counter[str]:
         compared = found.order_comparison
         verdict = "none" if compared is None else compared.preferred_model or "undecided"
         counts[verdict] += 1
-        counts["warned"] += any("order of the model, which" in text for text in found.warnings)
+        counts["warned"] += any(
+            one.explanation == "order" and one.parameters for one in found.findings
+        )
         own = found["L"]
         counts["own off"] += own.stderr is None or abs(own.value - delay) > COVERED * own.stderr
         if compared is not None:

@@ -391,15 +391,6 @@ def format_estimate(estimate: Mapping[str, Any]) -> str:
     return plain_estimate(estimate["value"], estimate["stderr"], status=status)
 
 
-def describe_status(estimate: Mapping[str, Any]) -> str:
-    """Describe the status of an estimate, with its reason if there is one."""
-    return (
-        f"{estimate['status']} ({estimate['reason']})"
-        if estimate["reason"]
-        else str(estimate["status"])
-    )
-
-
 def read_file(path: Path) -> bytes:
     """Read a file that the user names, or standard input for ``-``; end the command on failure."""
     try:

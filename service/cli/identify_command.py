@@ -25,7 +25,6 @@ from service.cli.common import (
     Segments,
     apply_setting,
     check_file,
-    describe_status,
     err,
     fail,
     fail_usage,
@@ -35,6 +34,7 @@ from service.cli.common import (
     out,
     parse_channels,
     print_json,
+    print_line,
     print_table,
     protect_file,
     read_file,
@@ -195,7 +195,9 @@ def identify(
             loaded, read.records, validation_records, body, printed, quiet=as_json
         )
     seconds = read_clock() - begun
-    result = replace(result, warnings=(*read.notes, *result.warnings))
+    from sysid.judgement.conclusions import add_reading_notes
+
+    result = add_reading_notes(result, read.notes)
     print_result(result, seconds, output, as_json=as_json, printed=printed)
     if report is not None:
         _write_report(report, Path(name_file(data)), loaded, result, seconds, body)
@@ -265,8 +267,13 @@ def check_body(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
         _refuse_model(body["model"], error)
     from service.jobs.record_checks import find_setting_faults
     from sysid.models.model import build_initial_parameters
+    from sysid.models.starts import replace_starts
 
-    parameters = (*model.parameters, *build_initial_parameters(model, pieces))
+    try:
+        started = replace_starts(model, job.initial)
+    except SysidError as error:
+        fail_usage(FIELD_ORIGINS.describe_faults(to_field_errors(error)))
+    parameters = (*model.parameters, *build_initial_parameters(started, pieces))
     wrong = find_setting_faults(job.to_normal_form(), model, parameters)
     if wrong:
         fail_usage(FIELD_ORIGINS.describe_faults(wrong))
@@ -361,8 +368,9 @@ def print_result(
     Warnings that are `printed` already are in the JSON only.
     """
     from service.jobs.stored_results import write_result_document
+    from sysid.results.findings import list_untold_reasons
     from sysid.results.result import find_output_unit
-    from sysid.results.summary import describe_order, describe_residuals
+    from sysid.results.summary import list_evidence
 
     document = write_result_document(result, seconds)
     if output is not None:
@@ -370,6 +378,7 @@ def print_result(
     if as_json:
         print_json(document)
         return
+    print_line(f"verdict: {result.verdict.text}")
     print_table(
         ("parameter", ">estimate ± standard error", "unit", "status"),
         (
@@ -377,7 +386,7 @@ def print_result(
                 parameter["name"],
                 format_estimate(parameter),
                 parameter["unit"],
-                describe_status(parameter),
+                parameter["status"],
             )
             for parameter in document["parameters"]
         ),
@@ -404,13 +413,11 @@ def print_result(
             f"inputs known before the record: {_format_history_span(known_before)}",
             markup=False,
         )
-    if result.residual_tests.passed is not None:
-        out.print(describe_residuals(result.residual_tests), markup=False, soft_wrap=True)
-    if result.order_comparison is not None:
-        out.print(describe_order(result.order_comparison), markup=False, soft_wrap=True)
-    out.print(f"verdict: {result.verdict.text}", markup=False, soft_wrap=True)
+    for line in list_evidence(result):
+        print_line(line)
     _print_posterior(result.posterior)
     _print_notes(warning for warning in result.warnings if warning not in printed)
+    _print_notes(list_untold_reasons(result.parameters, result.findings))
 
 
 def _print_notes(warnings: Iterable[str]) -> None:

@@ -155,11 +155,19 @@ def list_jobs(
             job["model"],
             _format_progress(job),
             *_single_run_rms(job),
-            job["outcome"] and job["outcome"]["verdict"],
+            _describe_outcome(job),
             format_moment(job["created_at"]),
         ),
         empty=_explain_no_jobs(state, filters),
     )
+
+
+def _describe_outcome(job: Mapping[str, Any]) -> str | None:
+    """Describe the verdict of the run that stands for a job, and which of several that is."""
+    if job["outcome"] is None:
+        return None
+    verdict: str = job["outcome"]["verdict"]
+    return f"best run: {verdict}" if job["progress"]["runs"] > 1 else verdict
 
 
 def _explain_no_jobs(state: list[JobState] | None, filters: dict[str, Any]) -> str:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from service.cli.common import (
     FieldOrigins,
-    describe_status,
     format_estimate,
     out,
     print_json,
@@ -23,7 +22,7 @@ from service.client.calls import ProblemError
 from service.core.bodies.job_fields import DATASETS_PATH
 from service.core.label_text import format_labels
 from service.trends.trend_text import PLAIN, build_tables, format_reference, list_notes
-from sysid.core.text import DASH, append_unit, plain_unit
+from sysid.core.text import DASH, append_unit, join_names, plain_unit
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -51,6 +50,8 @@ def print_run(run: Mapping[str, Any], as_json: bool) -> None:
     print_line(f"{run['id']}  run {run['number'] + 1} of {run['job']}: {run['state']}")
     if coordinates := run_coordinates(run):
         print_line(format_labels(coordinates))
+    if run["verdict"]:
+        print_line(f"verdict: {run['verdict']['text']}")
     print_table(
         ("parameter", ">estimate ± standard error", "unit", "95 % interval", "status"),
         [
@@ -59,7 +60,7 @@ def print_run(run: Mapping[str, Any], as_json: bool) -> None:
                 format_estimate(parameter),
                 parameter["unit"],
                 _format_interval(parameter),
-                describe_status(parameter),
+                parameter["status"],
             ]
             for parameter in run["parameters"]
         ],
@@ -67,14 +68,22 @@ def print_run(run: Mapping[str, Any], as_json: bool) -> None:
     )
     if run["rms"] is not None:
         print_line(_format_fit(run))
-    if run["verdict"]:
-        print_line(f"verdict: {run['verdict']['text']}")
     if run["error"]:
         print_line(run["error"])
     if run["reused_from"]:
         print_note(REUSE_NOTE.format(run["reused_from"]))
-    for warning in run["warnings"]:
-        print_note(warning)
+    for text in (*run["warnings"], *_list_untold_reasons(run)):
+        print_note(text)
+
+
+def _list_untold_reasons(run: Mapping[str, Any]) -> list[str]:
+    """List the reasons of statuses that no finding tells, each once with its parameters."""
+    told = {name for one in run["findings"] for name in one["parameters"]}
+    names: dict[str, list[str]] = {}
+    for parameter in run["parameters"]:
+        if parameter["reason"] and parameter["name"] not in told:
+            names.setdefault(parameter["reason"], []).append(parameter["name"])
+    return [f"{join_names(some)}: {reason}" for reason, some in names.items()]
 
 
 def print_reuse_note(job: Mapping[str, Any], runs: Sequence[Mapping[str, Any]], cure: str) -> None:

@@ -168,6 +168,8 @@ class BatchLabelDocument(TypedDict):
     """simulations of these runs"""
     spans: list[SpanDocument]
     """measured range of each output"""
+    flags: list[str]
+    """what speaks against these runs, in a few words each"""
     warnings: list[str]
     """warnings of these runs"""
 
@@ -313,10 +315,8 @@ class ComparedValueDocument(TypedDict):
     status: Literal[
         "identified",
         "not settled",
-        "not validated",
-        "order-dependent",
-        "prediction-dependent",
-        "hold-dependent",
+        "refuted",
+        "dependent",
         "ambiguous",
         "group",
         "at bound",
@@ -549,10 +549,8 @@ class EstimateDocument(TypedDict):
     status: Literal[
         "identified",
         "not settled",
-        "not validated",
-        "order-dependent",
-        "prediction-dependent",
-        "hold-dependent",
+        "refuted",
+        "dependent",
         "ambiguous",
         "group",
         "at bound",
@@ -620,6 +618,61 @@ class FigureDocument(TypedDict):
     """traces, as Plotly defines them"""
     layout: dict[str, Any]
     """layout, as Plotly defines it"""
+
+class FindingDocument(TypedDict):
+    """One explanation of what is left of the data, or one property of the estimate."""
+
+    explanation: str
+    """its name, such as `change of a parameter`"""
+    family: Literal[
+        "constancy",
+        "clocks",
+        "sensor",
+        "actuator",
+        "variance",
+        "input",
+        "reading",
+        "start",
+        "history",
+        "structure",
+        "noise",
+        "search",
+        "identifiability",
+        "validation",
+        "record",
+        "numerics",
+    ]
+    """what is explained otherwise: the sensor, the clocks, the structure of the model, and so on"""
+    severity: Literal["note", "caution", "serious"]
+    """serious: no estimate can be relied on. Caution: those of `parameters` cannot, or not without the condition. Note: worth knowing, and moves nothing"""
+    brief: str
+    """A few words, as they follow “trustworthy, but” or “not trustworthy:”"""
+    text: str
+    """whole sentences: what was found"""
+    advice: str
+    """what helps; a setting where there is one. Empty if nothing does"""
+    gain: float | None
+    """how much lower Schwarz's criterion is with the explanation: twice the logarithm of the odds. null where no likelihood is compared"""
+    moves: list[MoveDocument]
+    """what each parameter would be, the furthest move first"""
+    parameters: list[str]
+    """parameters that it makes doubtful"""
+    status: Literal[
+        "identified",
+        "not settled",
+        "refuted",
+        "dependent",
+        "ambiguous",
+        "group",
+        "at bound",
+        "unidentifiable",
+        "fixed",
+        "tied",
+        "unfinished",
+    ]
+    """status that these have then"""
+    reason: str
+    """why, as it follows the status of a parameter that has no move"""
 
 class FitPercentDocument(TypedDict):
     """Fit, 100 (1 - ‖y - ŷ‖ / ‖y - ȳ‖) %."""
@@ -816,6 +869,8 @@ class JobInDocument(TypedDict):
     """weight of each output, one number or one for each experiment. null: 1 for one output, else 1 / its standard deviation; then the noise of each output in each experiment is estimated"""
     skip: NotRequired[int]
     """first samples of each output that are not scored"""
+    initial: NotRequired[Literal["rest", "free", "measured", "auto"] | None]
+    """where the states start: at rest under the first inputs, at estimated or at measured values. auto compares them by the data. null: as the model's document says"""
     algorithm: NotRequired[AlgorithmInDocument]
     """settings of the search"""
     priority: NotRequired[int]
@@ -1111,6 +1166,18 @@ class ModelParameterDocument(TypedDict):
     tied: NotRequired[str | None]
     """expression that gives its value"""
 
+class MoveDocument(TypedDict):
+    """What a parameter would be under an explanation."""
+
+    parameter: str
+    """name of the parameter"""
+    value: float | None
+    """what it would be, in its unit"""
+    stderr: float | None
+    """its standard error there, in its unit; none if unknown"""
+    stderrs: float | None
+    """how far that is from the estimate, in standard errors of the estimate"""
+
 class NoiseInDocument(TypedDict):
     """Noise added to the measured outputs before fitting, for sensitivity studies."""
 
@@ -1184,6 +1251,10 @@ class OutcomeDocument(TypedDict):
 
     run: str
     """identifier of the run"""
+    cell: dict[str, Any]
+    """values of the sweep's axes, by their pointers"""
+    labels: dict[str, float | int | str | bool | None]
+    """labels of the cell, such as a length"""
     fit_estimation: float | None
     """fit to the estimation data, %"""
     fit_validation: float | None
@@ -1193,7 +1264,7 @@ class OutcomeDocument(TypedDict):
     verdict: str
     """the verdict in words"""
     warnings: int
-    """number of its warnings"""
+    """number of its warnings, notes included"""
 
 class ParameterInDocument(TypedDict):
     """Changes of one parameter of the model."""
@@ -1376,16 +1447,6 @@ class ReadyDocument(TypedDict):
     """objects can be written"""
     dispatcher: NotRequired[Literal["ok"]]
     """at least one claims jobs"""
-
-class ReasonDocument(TypedDict):
-    """One finding about a result."""
-
-    severity: Literal["note", "caution", "serious"]
-    """serious: do not rely on the estimates. Caution: they hold under a condition. Note: worth knowing"""
-    brief: str
-    """A few words, as they follow “trustworthy, but” or “not trustworthy:”"""
-    text: str
-    """whole sentences: what was found, and what helps"""
 
 class ReferenceDocument(TypedDict):
     """Reference: the run in use, its estimates, and earlier acceptances."""
@@ -1594,14 +1655,20 @@ class RunDocument(TypedDict):
     """one order less and one more; none if not compared, or no process with dead time"""
     delays: NotRequired[list[str] | None]
     """free parameters that time lags depend on"""
+    findings: NotRequired[list[FindingDocument]]
+    """what explains the residuals, and what speaks against the estimates; the most severe first"""
+    explained: NotRequired[bool | None]
+    """whether explanations of the residuals were looked for. In a sweep they are not, until a run is opened"""
     verdict: NotRequired[VerdictDocument | None]
-    """whether the estimates can be relied on, with the reasons"""
+    """whether the estimates can be relied on"""
     warnings: NotRequired[list[str]]
-    """what limits the result"""
+    """the sentences of the findings"""
     substeps: NotRequired[int | None]
     """integration steps in one grid step: the model's, or more"""
     selection: NotRequired[list[SelectedTermDocument] | None]
     """selected terms; empty if none were to be selected"""
+    initial: NotRequired[Literal["rest", "free", "measured"] | None]
+    """start of the states that the estimates assume; none: as the model's document says"""
 
 class RunPageDocument(TypedDict):
     """Runs of a job."""
@@ -1925,8 +1992,6 @@ class VerdictDocument(TypedDict):
     """Whether the estimates of a result can be relied on."""
 
     trust: Literal["trustworthy", "limited", "not trustworthy"]
-    """limited: the estimates hold under the condition that the text names"""
+    """limited: the estimates hold but for those that the text names, or under its condition"""
     text: str
-    """the verdict in words, such as “trustworthy, but L depends on the model's order”"""
-    reasons: list[ReasonDocument]
-    """the most severe first; empty if nothing speaks against the result"""
+    """the verdict in words, such as “trustworthy but for L: L changes at about 98 s”"""

@@ -11,13 +11,14 @@ from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from service.core.bodies.derived_bodies import derive_fields, take_setting
-from service.core.bodies.wire import Answer, Body, DescribedBy, Labels, Page, Pointer
+from service.core.bodies.wire import Answer, Body, Cell, DescribedBy, Labels, Page, Pointer
 from service.core.states import StateName
 from service.datasets.dataset_schemas import NoiseIn
 from service.items.reference_names import REFERENCE_PREFIX, RUN_PREFIX
 from sysid.core.settings import (
     FitSettings,
     GeneticAlgorithm,
+    InitialSetting,
     IslandChange,
     Loss,
     Migration,
@@ -267,6 +268,7 @@ class IdentificationIn(Body):
     loss: LossIn = Field(default=LossIn(), description="loss function")
     weights: dict[str, float | list[float]] | None = take_setting(FitSettings, "weights")
     skip: int = take_setting(FitSettings, "skip")
+    initial: InitialSetting | None = take_setting(FitSettings, "initial")
     algorithm: AlgorithmIn = Field(default=AlgorithmIn(), description="settings of the search")
     priority: int = Field(
         default=0, ge=-100, le=100, description="jobs of higher priority come first"
@@ -347,6 +349,8 @@ class OutcomeOut(Answer):
     """Outcome of a job: that of its only run, or of the best one by RMS."""
 
     run: str = Field(description="identifier of the run")
+    cell: Cell = Field(description="values of the sweep's axes, by their pointers")
+    labels: Labels = Field(description="labels of the cell, such as a length")
     fit_estimation: float | None = Field(description="fit to the estimation data, %")
     fit_validation: float | None = Field(
         description="fit to the validation data, %; null without them"
@@ -355,7 +359,7 @@ class OutcomeOut(Answer):
         description="limited: the estimates hold under the condition that the verdict names"
     )
     verdict: str = Field(description="the verdict in words")
-    warnings: int = Field(description="number of its warnings")
+    warnings: int = Field(description="number of its warnings, notes included")
 
 
 class JobOut(Answer):

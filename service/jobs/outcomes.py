@@ -22,6 +22,8 @@ def read_outcomes(session: Session, jobs: Sequence[Job]) -> Mapping[str, Outcome
     return {
         row.job: OutcomeOut(
             run=row.run,
+            cell=row.cell,
+            labels=row.labels,
             fit_estimation=row.fit_estimation,
             fit_validation=row.fit_validation,
             trust=row.parts["verdict"]["trust"],

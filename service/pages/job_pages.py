@@ -45,7 +45,9 @@ from service.repositories.reference_rows import ReferenceRepository
 from service.repositories.run_rows import RunRepository
 from service.repositories.search_conditions import NO_FILTER, ListFilter
 from service.runs.comparison import compare_runs, have_same_data
+from service.runs.explained import load_explained_result
 from service.runs.runs import parse_filters
+from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset, Job, Run
 from service.sweeps.sweep_schemas import NoiseSweepIn
 from sysid.core.settings import SEARCH_METHODS
@@ -117,7 +119,7 @@ JOB_HEADINGS: Sequence[tuple[str, str, Sequence[tuple[JobOrder, str]]]] = (
     ("Result", "", (("verdict", "descending"), ("worst-verdict", "ascending"))),
     ("Fit", "n", (("fit", "descending"), ("worst-fit", "ascending"))),
     ("RMS", "n", (("rms", "ascending"),)),
-    ("Warnings", "n", ()),
+    ("Findings", "n", ()),
     ("Took", "n", ()),
     ("Age", "n", (("newest", "ascending"), ("oldest", "descending"))),
 )
@@ -199,6 +201,7 @@ def _link_headings(selection: JobSelection) -> list[dict[str, str]]:
 
 def job_page(
     session: Session,
+    store: ObjectStore,
     job_id: str,
     base_url: str,
     run_id: str | None = None,
@@ -228,7 +231,7 @@ def job_page(
         etag=compute_etag(job),
         obstacle=_describe_obstacle(session, job),
         runs=[load_run_row(session, StoredRun.from_rows(job, run)) for run in page.items],
-        run=load_full_run(session, stored) if stored else None,
+        run=load_full_run(session, store, stored) if stored else None,
         next_runs=_encode_query({"cell": cell, "cursor": page.next}) if page.next else "",
         grid=grid,
         is_listed=is_listed,
@@ -312,10 +315,10 @@ def _name_datasets(
     ]
 
 
-def run_page(session: Session, run_id: str, base_url: str) -> str:
+def run_page(session: Session, store: ObjectStore, run_id: str, base_url: str) -> str:
     """Render the page of a run's job, with this run in full."""
     run = RunRepository(session).get(run_id)
-    return job_page(session, run.job_id, base_url, run.id)
+    return job_page(session, store, run.job_id, base_url, run.id)
 
 
 def datasets_page(
@@ -354,12 +357,15 @@ def dataset_page(session: Session, dataset_id: str) -> str:
 
 def load_run_row(session: Session, stored: StoredRun) -> RunView:
     """Load a run as a row of a table."""
-    return to_run_view(stored, stored.rms_unit(session), {})
+    return to_run_view(stored, stored.result, stored.rms_unit(session), {})
 
 
-def load_full_run(session: Session, stored: StoredRun) -> RunView:
-    """Load a run with the heights of its plots, so that the page reserves their room."""
-    result, model = stored.result, stored.model
+def load_full_run(session: Session, store: ObjectStore, stored: StoredRun) -> RunView:
+    """Load a run with explained residuals, and with the heights of its plots.
+
+    So the page reserves their room.
+    """
+    result, model = load_explained_result(session, store, stored), stored.model
     has_signals = stored.run.state is JobState.SUCCEEDED
     names = list_free_parameters(session, stored)
     counts = len(model.outputs), len(model.inputs)
@@ -376,7 +382,7 @@ def load_full_run(session: Session, stored: StoredRun) -> RunView:
             "waterfall": WATERFALL_HEIGHT if result.islands else 0,
             "posterior": posterior_height(len(sampled)) if sampled else 0,
         }
-    return to_run_view(stored, stored.rms_unit(session), heights)
+    return to_run_view(stored, result, stored.rms_unit(session), heights)
 
 
 def _residuals_height(result: Result) -> int:

@@ -1,9 +1,13 @@
 """Texts of a result, as filters of the templates: `estimate | value_text`."""
 
+from collections.abc import Sequence
 from math import isfinite
+from typing import NamedTuple
 
+from service.pages.forms.choices import write_choice
 from sysid.core.text import (
     DASH,
+    append_unit,
     format_criterion,
     format_estimate,
     format_interval,
@@ -11,15 +15,108 @@ from sysid.core.text import (
     format_p_value,
     join_estimate,
     plain_unit,
+    rewrite_settings,
 )
 from sysid.identifiability.combinations import IdentifiableCombination
+from sysid.judgement.levels import NOTABLE_MOVE
 from sysid.models.equation_display import format_equations
 from sysid.models.model import Model
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import ResidualTest
+from sysid.results.findings import Finding, list_untold_reasons
 from sysid.results.parts import OrderComparison, OrderFit
+from sysid.results.result import Result
 from sysid.results.summary import describe_search
 from sysid.uncertainty.estimates import Estimate, PosteriorParameter
+
+
+class ExplainedValue(NamedTuple):
+    """Value of a parameter under an explanation."""
+
+    text: str
+    is_notable: bool
+
+
+class ExplanationRow(NamedTuple):
+    """An explanation, how much lower its BIC is, and its value of each parameter."""
+
+    brief: str
+    gain: str
+    cells: Sequence[ExplainedValue]
+
+
+class ExplanationTable(NamedTuple):
+    """Open explanations of a result; `headings` are parameters that one of them moves."""
+
+    headings: Sequence[str]
+    rows: Sequence[ExplanationRow]
+
+
+def tabulate_explanations(result: Result) -> ExplanationTable | None:
+    """Tabulate what moves an estimate, below the estimates themselves; None if nothing does."""
+    explanations = [one for one in result.findings if one.severity != "note" and one.moves]
+    moved = {
+        move.parameter
+        for one in explanations
+        for move in one.moves
+        if abs(move.stderrs) > NOTABLE_MOVE
+    }
+    estimates = [one for one in result.parameters if one.name in moved]
+    if not estimates:
+        return None
+    values = [
+        ExplainedValue(join_estimate(one.value, one.stderr, status=one.status), is_notable=False)
+        for one in estimates
+    ]
+    return ExplanationTable(
+        [append_unit(one.name, one.unit) for one in estimates],
+        [
+            ExplanationRow("the model holds", "", values),
+            *(_tabulate_explanation(one, estimates) for one in explanations),
+        ],
+    )
+
+
+def _tabulate_explanation(finding: Finding, estimates: Sequence[Estimate]) -> ExplanationRow:
+    moves = {move.parameter: move for move in reversed(finding.moves)}
+    cells = [
+        ExplainedValue(
+            join_estimate(move.value, move.stderr), is_notable=abs(move.stderrs) > NOTABLE_MOVE
+        )
+        if (move := moves.get(one.name))
+        else ExplainedValue(DASH, is_notable=False)
+        for one in estimates
+    ]
+    return ExplanationRow(finding.brief, format_criterion(finding.gain), cells)
+
+
+def describe_soundness(result: Result) -> str:
+    """Describe the evidence for a result that no finding speaks against."""
+    passed = result.residual_tests.passed
+    if passed is None:
+        residuals = "residuals were not tested"
+    elif passed:
+        residuals = "the residuals pass their tests"
+    elif result.explained:
+        residuals = "the residuals are no white noise, but no explanation of that moves an estimate"
+    else:
+        residuals = "the residuals fail a test, but weakly"
+    free = [one for one in result.parameters if one.is_free]
+    is_determined = all(one.status == "identified" for one in free)
+    known = ", and the data determine every parameter" if is_determined else ""
+    return f"The search settled, {residuals}{known}."
+
+
+def list_note_texts(result: Result) -> list[str]:
+    """List what is noted of a result, and reasons of statuses that no finding tells."""
+    notes = [one.sentences for one in result.findings if one.severity == "note"]
+    untold = list_untold_reasons(result.parameters, result.findings)
+    return [write_choices(text) for text in dict.fromkeys([*notes, *untold])]
+
+
+def write_choices(text: str) -> str:
+    """Write settings in a text as the form has them."""
+    return rewrite_settings(text, write_choice)
 
 
 def format_value_text(estimate: Estimate) -> str:
@@ -109,6 +206,10 @@ def list_equations(model: Model) -> list[str]:
 
 
 RESULT_FILTERS = {
+    "explanation_table": tabulate_explanations,
+    "soundness": describe_soundness,
+    "note_texts": list_note_texts,
+    "choices": write_choices,
     "value_text": format_value_text,
     "stderr_text": format_stderr_text,
     "interval_text": format_interval_text,

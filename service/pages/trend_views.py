@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
+from typing import NamedTuple
 
 from sqlalchemy.orm import Session
 
@@ -63,9 +64,16 @@ FLAG_SECONDS = 0.15
 """Time for the flags of a list. Batches that come later have theirs in the next view."""
 
 
-def count_trend_flags(session: Session, jobs: Sequence[Job]) -> dict[str, int]:
-    """Count the findings that need attention in each batch that has ended, by the job."""
-    counts: dict[str, int] = {}
+class FlagCount(NamedTuple):
+    """What is told of a batch: flags need attention, other notes do not."""
+
+    flags: int
+    notes: int
+
+
+def count_trend_flags(session: Session, jobs: Sequence[Job]) -> dict[str, FlagCount]:
+    """Count what is told of each batch that has ended, by the job."""
+    counts: dict[str, FlagCount] = {}
     started = perf_counter()
     for job in jobs:
         if not job.state.is_terminal or not job.n_done or job.n_runs > MAX_FLAGGED_RUNS:
@@ -73,7 +81,8 @@ def count_trend_flags(session: Session, jobs: Sequence[Job]) -> dict[str, int]:
         trend = load_trend(session, job)
         if trend is not None:
             tables = build_tables(trend.model_dump(), TYPESET)
-            counts[job.id] = sum(len(row.flags) for row in tables.rows)
+            told = {text for label in trend.labels for text in label.warnings}
+            counts[job.id] = FlagCount(sum(len(row.flags) for row in tables.rows), len(told))
         if perf_counter() - started > FLAG_SECONDS:
             break
     return counts

@@ -15,9 +15,8 @@ from service.jobs.job_schemas import JobOut, OutcomeOut
 from service.jobs.outcomes import is_batch
 from service.jobs.stored_run import StoredRun
 from service.jobs.submit import to_job_out
-from service.pages.forms.choices import write_choice
 from service.storage.tables import Event, Job
-from sysid.core.text import rewrite_settings
+from sysid.results.result import Result
 
 Document = Mapping[str, Any]
 
@@ -40,7 +39,6 @@ class RunView(Answer):
     seconds: float | None
     error: str | None
     result: Any
-    warnings: Sequence[str]
     note: str | None
     tags: Sequence[str]
     etag: str
@@ -79,6 +77,11 @@ class JobView(JobOut):
     def best_rms(self) -> float | None:
         """RMS of the best run."""
         return None if self.is_batch else self.progress.best_rms
+
+    @property
+    def outcome_place(self) -> str:
+        """Place in the sweep of the run that stands for the job; empty for a single run."""
+        return "" if self.outcome is None else format_cell(self.outcome.cell, self.outcome.labels)
 
     @property
     def rate(self) -> float | None:
@@ -133,10 +136,11 @@ def to_job_view(job: Job, unit: str, now: datetime, outcome: OutcomeOut | None =
     return JobView.from_source(document, lost_leases=job.lost_leases, max_attempts=job.max_attempts)
 
 
-def to_run_view(stored: StoredRun, unit: str, heights: Mapping[str, int]) -> RunView:
-    """Build the view of a run; `heights` (px) are those of its plots."""
-    run, result = stored.run, stored.result
-    warnings = () if result is None else result.warnings
+def to_run_view(
+    stored: StoredRun, result: Result | None, unit: str, heights: Mapping[str, int]
+) -> RunView:
+    """Build the view of a run and its result; `heights` (px) are those of its plots."""
+    run = stored.run
     return RunView.from_source(
         run,
         title=f"run {run.number + 1}",
@@ -144,7 +148,6 @@ def to_run_view(stored: StoredRun, unit: str, heights: Mapping[str, int]) -> Run
         cell_text=format_cell(run.cell, run.labels),
         unit=unit,
         result=result,
-        warnings=[rewrite_settings(note, write_choice) for note in warnings],
         tags=run.tags or (),
         etag=compute_etag(run),
         has_signals=run.state is JobState.SUCCEEDED,

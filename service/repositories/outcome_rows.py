@@ -19,6 +19,8 @@ class OutcomeRow(NamedTuple):
 
     job: str
     run: str
+    cell: Document
+    labels: Document
     fit_estimation: float | None
     fit_validation: float | None
     parts: Document
@@ -29,12 +31,13 @@ def read_outcome_rows(
 ) -> list[OutcomeRow]:
     """Read one row for each of these jobs that has a run with a result."""
     columns = [Run.result.expression[part] for part in parts]
-    query = select(Run.job_id, Run.id, Run.fit_estimation, Run.fit_validation, *columns).where(
+    row = Run.job_id, Run.id, Run.cell, Run.labels, Run.fit_estimation, Run.fit_validation
+    query = select(*row, *columns).where(
         match_outcomes(session, jobs), Run.state == JobState.SUCCEEDED, Run.deleted_at.is_(None)
     )
     return [
-        OutcomeRow(job, run, fit, validated, dict(zip(parts, values, strict=True)))
-        for job, run, fit, validated, *values in session.execute(query)
+        OutcomeRow(*values[: len(row)], dict(zip(parts, values[len(row) :], strict=True)))
+        for values in session.execute(query)
     ]
 
 

@@ -12,13 +12,15 @@ from service.storage.sessions import find_project
 from service.storage.tables import Run
 from sysid.core.value_documents import decode, list_fields
 from sysid.residuals.onset_delay import OnsetDelay
+from sysid.results.findings import Finding
 from sysid.results.result import Agreements, Result
 from sysid.uncertainty.estimates import Estimate
 
 _RESULT_PARTS = {
     field.name: field.hint
     for field in list_fields(Result)
-    if field.name in ("parameters", "onset_delays", "agreement", "warnings", "noise_model")
+    if field.name
+    in ("parameters", "onset_delays", "agreement", "findings", "warnings", "noise_model")
 }
 
 
@@ -34,6 +36,7 @@ class TrendRow(NamedTuple):
     parameters: tuple[Estimate, ...]
     onset_delays: tuple[OnsetDelay, ...]
     agreement: Agreements
+    findings: tuple[Finding, ...]
     warnings: tuple[str, ...]
     noise_model: str
 

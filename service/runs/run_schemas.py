@@ -29,7 +29,7 @@ from sysid.simulation.fit_metrics import ChannelMetrics
 from sysid.uncertainty.estimates import Estimate
 
 
-@extend_later_by(Result, parameters=[], warnings=[])
+@extend_later_by(Result, parameters=[], findings=[], warnings=[])
 class RunOut(Answer):
     """One identification: its cell of the sweep, progress, and result.
 

@@ -14,6 +14,7 @@ from service.jobs.stored_run import StoredRun, load_run
 from service.repositories.job_rows import JobRepository
 from service.repositories.lineage_rows import WrittenProgress, read_written_progress
 from service.repositories.run_rows import RunOrder, RunRepository
+from service.runs.explained import load_explained_result
 from service.runs.run_schemas import (
     HistoryOut,
     ImprovementOut,
@@ -23,9 +24,11 @@ from service.runs.run_schemas import (
     RunPage,
 )
 from service.storage.columns import Document
+from service.storage.objects import ObjectStore
 from service.storage.tables import Job, Run
 from sysid.core.value_documents import encode
 from sysid.models.parameters import Parameter
+from sysid.results.result import Result
 from sysid.uncertainty.estimates import Estimate
 
 MAX_OPEN_PROGRESS = 0.99  # of an unfinished run: refinement is still to come
@@ -64,13 +67,16 @@ def list_runs(
     return RunPage(items=items, next=page.next)
 
 
-def get_run(session: Session, run_id: str) -> RunOut:
-    """Read one run with its result document."""
+def get_run(session: Session, run_id: str, store: ObjectStore | None = None) -> RunOut:
+    """Read one run with its result document; from a `store` its residuals are explained too."""
     stored = load_run(session, run_id)
     run = stored.run
     progress = read_written_progress(session, [run.id]) if run.result is None else {}
     answer = to_run_out(run, stored.job, progress.get(run.id))
     answer = answer.model_copy(update={"rms_unit": stored.rms_unit(session)})
+    explained = None if store is None else load_explained_result(session, store, stored)
+    if explained is not None and explained is not stored.result:
+        answer = answer.model_copy(update=encode(explained, Result))
     if run.result is not None or not run.state.is_terminal:
         return answer
     return answer.model_copy(update={"parameters": _list_best_parameters(session, stored)})

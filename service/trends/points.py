@@ -224,6 +224,11 @@ def to_label_out(
         runs=[row.id for row in rows],
         evaluations=sum(row.evaluations for row in rows),
         spans=list(spans.values()),
+        flags=list(
+            dict.fromkeys(
+                one.brief for row in rows for one in row.findings if one.severity != "note"
+            )
+        ),
         warnings=list(dict.fromkeys(text for row in rows for text in row.warnings)),
     )
 

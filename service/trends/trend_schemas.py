@@ -114,6 +114,7 @@ class BatchLabelOut(Answer):
     runs: list[str] = Field(description="identifiers of the runs")
     evaluations: int = Field(description="simulations of these runs")
     spans: list[SpanOut] = Field(description="measured range of each output")
+    flags: list[str] = Field(description="what speaks against these runs, in a few words each")
     warnings: list[str] = Field(description="warnings of these runs")
 
 

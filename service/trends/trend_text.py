@@ -20,9 +20,6 @@ from sysid.core.text import (
 
 QuantityDocument = Mapping[str, Any]
 
-USUAL_STATUSES = ("identified", "group", "measured", "not measured")
-"""Statuses that need no attention."""
-
 
 class Style(NamedTuple):
     """Number formats; `between` joins the ends of an interval."""
@@ -150,18 +147,17 @@ def _prediction_row(
 
 
 def list_flags(label_runs: Mapping[str, Any], quantities: list[QuantityDocument]) -> list[str]:
-    """List the findings that need attention in the runs of one label."""
-    flags = []
+    """List what needs attention in the runs of one label."""
+    flags = [*label_runs["flags"]]
     for quantity in quantities:
         for point in quantity["points"]:
             if point["x"] == label_runs["x"]:
                 flags += [f"{quantity['name']} {text}" for text in _list_point_flags(point)]
-    separable = [text for text in label_runs["warnings"] if "not separable" in text]
-    return flags + [text.partition(":")[0].partition(" (")[0] for text in separable]
+    return flags
 
 
 def _list_point_flags(point: Mapping[str, Any]) -> list[str]:
-    flags = [word for word in point["status"].split(", ") if word not in USUAL_STATUSES]
+    flags = []
     if point["is_outlier"]:
         flags.append(f"outlier (p = {point['p_value']:.2g})")
     for drift in point["drifts"]:

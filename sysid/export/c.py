@@ -3,6 +3,7 @@
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from string import Template
 from typing import ClassVar
 
 from sysid.control.linear_form import IdentifiedModel
@@ -19,6 +20,7 @@ from sysid.export.program import (
     time_loop,
     write_delay_steps,
 )
+from sysid.kernels.integrators import HALVINGS
 from sysid.language.functions import FUNCTIONS, Level
 from sysid.models.model import MeasuredInitial
 from sysid.simulation.grid import GRID_TOLERANCE
@@ -31,7 +33,7 @@ _RESERVED_WORDS = (
     "between between_on_grid held sample past lately n t p step steps i part stage slope work "
     "points grid ratio ramp half width meets place whole averaged averaged_on_grid sample_time "
     "dt h k now y0 y1 yn j0 j1 jn gamma signgam unix linux i386 EOF stdin stdout stderr assert "
-    "BUFSIZ RAND_MAX table_interval pchip_rise pchip_slope"
+    "BUFSIZ RAND_MAX table_interval pchip_rise pchip_slope begin end behind duration number side"
 )
 _LINE_WIDTH = 92
 
@@ -103,6 +105,21 @@ class CLanguage(TargetLanguage):
         """Write the brace that ends a loop."""
         return ["}"]
 
+    def open_parts(self, stem: str, most: int) -> list[str]:
+        """Write the first lines of a loop over the parts of a step."""
+        return [
+            "double begin = 0.0;",
+            "for (int number = 0; begin < 1.0; ++number) {",
+            "    double end = 1.0, behind = 1.0;",
+            f"    if (number < {most})",
+            f"        end = {stem}_switch(p, dt, step, begin, &behind);",
+            "    const double duration = (end - begin)*dt;",
+        ]
+
+    def close_parts(self) -> list[str]:
+        """Write the step to the next part, and the brace."""
+        return ["    begin = behind;", "}"]
+
 
 def write_c_source(identified: IdentifiedModel) -> str:
     """Write a C99 file: ``NAME_parameters``, ``NAME_identified`` and ``NAME_simulate``.
@@ -117,9 +134,9 @@ def write_c_source(identified: IdentifiedModel) -> str:
         [*_RESERVED_WORDS.split(), *(function.c for function in FUNCTIONS.values())]
     )
     stem = names.make_identifier(identified.model.name)
-    for suffix in ("parameters", "identified", "simulate"):
+    for suffix in ("parameters", "identified", "sides", "switch", "simulate"):
         names.make_identifier(f"{stem}_{suffix}")
-    program = GeneratedProgram(identified, language, names, prefix="p->")
+    program = GeneratedProgram(identified, language, names, prefix="p->", stem=stem)
     loop = [*time_loop(program, _write_runge_kutta), *_write_outputs(program)]
     body = [
         *_write_checks(program),
@@ -130,6 +147,7 @@ def write_c_source(identified: IdentifiedModel) -> str:
         "free(work);",
         "return 0;",
     ]
+    switches = _write_switches(program)
     helpers = list_needed_helpers(HELPERS, program)
     parts = [
         _write_header(identified, stem),
@@ -137,6 +155,7 @@ def write_c_source(identified: IdentifiedModel) -> str:
         _write_struct(program, stem),
         _write_identified_function(program, stem),
         *helpers,
+        *switches,
         _write_simulate_comment(program),
         _write_signature(program, stem),
         "{",
@@ -314,33 +333,80 @@ def _write_state_arrays(program: GeneratedProgram) -> list[str]:
 
 # ---- the time loop --------------------------------------------------------------------------
 def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
+    """Write the steps, each with its four stages, or with those of each of its parts."""
+    names = [state.name for state in program.identified.model.states]
+    arrays = [program.array_names[name] for name in names]
+    if not program.sides:
+        body = [
+            *_write_stages(program, ("0.0", "0.5", "1.0"), [f"{one}[step]" for one in arrays]),
+            *_write_mean_slopes("dt", [(f"{one}[step + 1]", f"{one}[step]") for one in arrays]),
+        ]
+    else:
+        now = [f"now[{i}]" for i in range(len(names))]
+        body = [
+            f"double now[{len(names)}];",
+            *(f"{place} = {one}[step];" for place, one in zip(now, arrays, strict=True)),
+            *program.language.open_parts(program.stem, len(program.sides)),
+            *indent_lines(_write_stages(program, ("begin", "0.5*(begin + end)", "end"), now)),
+            *indent_lines(_write_mean_slopes("duration", [(place, place) for place in now])),
+            *program.language.close_parts(),
+            *(f"{one}[step + 1] = {place};" for place, one in zip(now, arrays, strict=True)),
+        ]
+    return ["for (long step = 0; step < steps; ++step) {", *indent_lines(body), "}"]
+
+
+def _write_stages(
+    program: GeneratedProgram, places: tuple[str, str, str], now: list[str]
+) -> list[str]:
     """Write the four stages as a loop; each starts from the slope of the one before."""
     states = program.identified.model.states
+    first, middle, last = places
+    moves = "(stage == 3 ? 1.0 : 0.5)*duration" if program.sides else "part*dt"
     lines = [
-        "for (long step = 0; step < steps; ++step) {",
-        f"    double slope[4][{len(states)}];",
-        "    for (int stage = 0; stage < 4; ++stage) {",
-        "        const double part = stage == 0 ? 0.0 : stage == 3 ? 1.0 : 0.5;",
+        f"double slope[4][{len(states)}];",
+        "for (int stage = 0; stage < 4; ++stage) {",
+        f"    const double part = stage == 0 ? {first} : stage == 3 ? {last} : {middle};",
     ]
     for i, state in enumerate(states):
-        every, now = program.array_names[state.name], program.present_names[state.name]
-        moved = f"{every}[step] + (stage == 0 ? 0.0 : part*dt*slope[stage - 1][{i}])"
-        lines.append(f"        const double {now} = {moved};")
-    lines += [f"        (void){program.present_names[state.name]};" for state in states]
+        moved = f"{now[i]} + (stage == 0 ? 0.0 : {moves}*slope[stage - 1][{i}])"
+        lines.append(f"    const double {program.present_names[state.name]} = {moved};")
+    lines += [f"    (void){program.present_names[state.name]};" for state in states]
     for i in range(len(states)):
         lines += indent_lines(
-            _wrap_statement(f"slope[stage][{i}] = ", equation(program, "slope", i)), 2
+            _wrap_statement(f"slope[stage][{i}] = ", equation(program, "slope", i))
         )
     if first_rises := program.assign_rises("first", "slope[0]"):
-        lines += ["        if (stage == 0) {", *indent_lines(first_rises, 3), "        }"]
-    lines += ["    }", *indent_lines(program.assign_rises("last", "slope[3]"))]
-    for i, state in enumerate(states):
-        every = program.array_names[state.name]
+        when = "stage == 0 && number == 0" if program.sides else "stage == 0"
+        lines += [f"    if ({when}) {{", *indent_lines(first_rises, 2), "    }"]
+    return [*lines, "}", *program.assign_rises("last", "slope[3]")]
+
+
+def _write_mean_slopes(width: str, moves: list[tuple[str, str]]) -> list[str]:
+    """Write the end of a step of Runge and Kutta: each state's target and start."""
+    lines = []
+    for i, (target, start) in enumerate(moves):
         mean = f"slope[0][{i}] + 2.0*slope[1][{i}] + 2.0*slope[2][{i}] + slope[3][{i}]"
-        lines += indent_lines(
-            _wrap_statement(f"{every}[step + 1] = ", f"{every}[step] + dt/6.0*({mean})")
+        lines += _wrap_statement(f"{target} = ", f"{start} + {width}/6.0*({mean})")
+    return lines
+
+
+def _write_switches(program: GeneratedProgram) -> list[str]:
+    """Write the functions that find the switches in time of a step; none if there are none."""
+    if not program.sides:
+        return []
+    sides = [
+        line
+        for i, side in enumerate(program.write_sides())
+        for line in _wrap_statement(f"side[{i}] = ", side)
+    ]
+    return [
+        _SWITCHES.substitute(
+            stem=program.stem,
+            sides="\n".join(indent_lines(sides)),
+            most=len(program.sides),
+            halvings=HALVINGS,
         )
-    return [*lines, "}"]
+    ]
 
 
 def _write_outputs(program: GeneratedProgram) -> list[str]:
@@ -400,6 +466,38 @@ def _wrap_statement(before: str, text: str) -> list[str]:
 
 
 # ---- functions that a program calls -----------------------------------------------------------
+_SWITCHES = Template("""\
+/* Whole numbers at `part` of a step, each of which changes at a switch in time. */
+static void ${stem}_sides(
+    const ${stem}_parameters *p, double dt, long step, double part, double *side)
+{
+    (void)p;
+$sides
+}
+
+/* Place in a step just before the next switch after `begin`, and just behind it. */
+static double ${stem}_switch(
+    const ${stem}_parameters *p, double dt, long step, double begin, double *behind)
+{
+    double before[$most], side[$most], low = begin, high = 1.0;
+    ${stem}_sides(p, dt, step, begin, before);
+    for (int trial = 0; trial <= $halvings; ++trial) {
+        const double part = trial == 0 ? high : 0.5*(low + high);
+        int differs = 0;
+        ${stem}_sides(p, dt, step, part, side);
+        for (int i = 0; i < $most; ++i)
+            differs |= side[i] != before[i];
+        if (!differs)
+            low = part;
+        else
+            high = part;
+        if (low == 1.0)
+            break;
+    }
+    *behind = high;
+    return low;
+}
+""")
 _BETWEEN = """\
 /* Signal at a place in samples, on a line between them; its end values outside. */
 static double between(const double *signal, long n, double place)

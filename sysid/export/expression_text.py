@@ -95,6 +95,15 @@ class TargetLanguage(Protocol):
     def close_loop(self) -> list[str]:
         """Write the end of a loop."""
 
+    def open_parts(self, stem: str, most: int) -> list[str]:
+        """Write the first lines of a loop over the parts of a step, with at most `most` switches.
+
+        A part begins at `begin` and ends at `end`, in steps, and takes `duration` in s.
+        """
+
+    def close_parts(self) -> list[str]:
+        """Write the end of a loop over parts."""
+
 
 class ExportScope(Protocol):
     """Meaning of names at one position of the program; the texts can stand anywhere."""

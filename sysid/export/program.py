@@ -8,6 +8,7 @@ functions, which are written only if they are called.
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from math import ceil
 from typing import Literal
 
@@ -26,6 +27,7 @@ from sysid.kernels.signals.past_reads import (
     find_averaged_inputs,
     is_difference,
     list_stored_histories,
+    list_switch_sides,
     reads_cubics,
 )
 from sysid.language.delays import has_varying_delay
@@ -44,6 +46,7 @@ class GeneratedProgram:
     language: TargetLanguage
     identifiers: Identifiers
     prefix: str = ""
+    stem: str = ""
     parameter_names: dict[str, str] = field(default_factory=dict)
     input_names: dict[str, str] = field(default_factory=dict)
     output_names: dict[str, str] = field(default_factory=dict)
@@ -110,6 +113,16 @@ class GeneratedProgram:
     def grid_step(self) -> float | None:
         """Step of the simulation's own grid in s; None: the grid of the samples."""
         return None if self.is_recursion else self.identified.model.solver.step
+
+    @property
+    def sides(self) -> tuple[Expression, ...]:
+        """Sides of the switches in time; if there are any, steps are divided."""
+        return list_switch_sides(self.identified.model)
+
+    def write_sides(self) -> list[str]:
+        """Write the sides at a `part` of a step."""
+        scope = LoopScope(self, "slope")
+        return [write_expression(side, self.language, scope) for side in self.sides]
 
     @property
     def n_start_samples(self) -> int:
@@ -219,8 +232,9 @@ class GeneratedProgram:
 class LoopScope(ExportScope):
     """Position in the loop where an expression is evaluated.
 
-    ``slope``: `part` of a step after its start; ``update``: at its start; ``recursion``: at sample
-    k; ``output``: at a finished step. `equation` is the number of the equation.
+    ``slope``: `part` of a step after its start; ``update``: at its start, or where a part of it
+    begins; ``recursion``: at sample k; ``output``: at a finished step. `equation` is the number of
+    the equation.
     """
 
     program: GeneratedProgram
@@ -242,17 +256,20 @@ class LoopScope(ExportScope):
         """Write a state or an input, now or in the past."""
         return self._write_input(past) if past.kind == "input" else self._write_state(past)
 
+    @property
+    def _part(self) -> str:
+        """Place in the present step; empty: at a finished step."""
+        is_divided = self.stage == "update" and bool(self.program.sides)
+        return "begin" if is_divided else "part" if self.stage == "slope" else ""
+
     def _write_index(self) -> str:
-        return "(step + part)" if self.stage == "slope" else self.program.loop_variable
+        return f"(step + {self._part})" if self._part else self.program.loop_variable
 
     def _write_position(self, past: PastValue) -> str:
         offset = f"-{past.offset}" if past.offset else ""
         delay = f" - {self._write_delay(past)}" if past.delay is not None else ""
-        return (
-            ("step + part" if self.stage == "slope" else self.program.loop_variable)
-            + offset
-            + delay
-        )
+        place = f"step + {self._part}" if self._part else self.program.loop_variable
+        return place + offset + delay
 
     def _write_delay(self, past: PastValue) -> str:
         """Write a time lag in steps: its variable, or what it is now if it changes with inputs."""
@@ -270,9 +287,9 @@ class LoopScope(ExportScope):
         early = self.stage == "output" and past.offset > 0  # may lie before the record
         if past.delay is None and program.grid_step is None and not early:
             if held:
-                index = "step" if self.stage == "slope" else self._write_position(past)
+                index = "step" if self._part else self._write_position(past)
                 return program.language.write_element(name, index, substeps)
-            if substeps == 1 and self.stage != "slope":
+            if substeps == 1 and not self._part:
                 return program.language.write_element(name, self._write_position(past), 1)
         position = self._write_sample_position(past)
         on_grid = "" if program.grid_step is None else "_on_grid"
@@ -301,7 +318,7 @@ class LoopScope(ExportScope):
             return " + ramp"
         if past.delay is not None:
             return ""
-        return " + ramp*(1.0 - 2.0*part)" if self.stage == "slope" else " + ramp"
+        return f" + ramp*(1.0 - 2.0*{self._part})" if self._part else " + ramp"
 
     # ---- states ---------------------------------------------------------------------------
     def _write_state(self, past: PastValue) -> str:
@@ -321,25 +338,22 @@ class LoopScope(ExportScope):
 
     def _write_state_position(self, name: str) -> str:
         """Write the position in steps from which a delay of a state counts."""
-        if self.stage == "slope":
-            return "step + part"
-        is_later = self.stage == "update" and self._is_updated(name)
-        return "step + 1" if is_later else self.program.loop_variable
+        place = self._write_state_part(name)
+        return f"step + {place}" if place else self.program.loop_variable
+
+    def _write_state_part(self, name: str) -> str:
+        """Write the place in the present step at which a state is read; empty: its start."""
+        if self.stage == "update" and self._is_updated(name):
+            return "end" if self._part else "1.0"
+        return self._part
 
     def _write_delayed_state(self, past: PastValue) -> str:
         program = self.program
         every, before = program.list_arrays(past.name), program.write_history(past.name)
         delay = self._write_state_delay(past)
-        if self.stage == "slope":
-            present = self._write_present_state(past.name)
-            return program.write_helper_call(
-                "lately", *every, before, "step", "part", present, delay
-            )
-        if self.stage == "update" and self._is_updated(past.name):
-            following = program.next_names[past.name]
-            return program.write_helper_call(
-                "lately", *every, before, "step", "1.0", following, delay
-            )
+        if place := self._write_state_part(past.name):
+            there = self._write_present_state(past.name)
+            return program.write_helper_call("lately", *every, before, "step", place, there, delay)
         return program.write_helper_call("past", *every, before, program.loop_variable, delay)
 
     def _write_earlier_state(self, past: PastValue) -> str:
@@ -368,7 +382,7 @@ class LoopScope(ExportScope):
             return program.present_names[name] if self._is_updated(name) else f"{every}[k-1]"
         if self.stage == "update" and self._is_updated(name):
             return program.next_names[name]
-        return f"{every}[{program.loop_variable}]"
+        return f"{every}[{program.loop_variable}{' + 1' if self._part else ''}]"
 
     def _is_updated(self, name: str) -> bool:
         """Whether the state's next value is computed before the equation."""
@@ -454,15 +468,26 @@ def _write_recursion(program: GeneratedProgram) -> list[str]:
 
 
 def _write_euler(program: GeneratedProgram) -> list[str]:
-    model, language = program.identified.model, program.language
+    """Write Euler's methods; the states of a divided step are those of the next as they come."""
+    model, language, most = program.identified.model, program.language, len(program.sides)
+    present, width = ("step + 1", "duration") if most else ("step", "dt")
     body: list[str] = []
     for i, state in enumerate(model.states):
         slope = equation(program, "update", i, Level.PRODUCT)
-        text = f"{program.array_names[state.name]}[step] + dt*{slope}"
+        text = f"{program.array_names[state.name]}[{present}] + {width}*{slope}"
         body += language.assign(program.next_names[state.name], text, is_new=True)
     for state in model.states:
         target = f"{program.array_names[state.name]}[step + 1]"
         body += language.assign(target, program.next_names[state.name])
+    if most:
+        parts = [
+            *language.open_parts(program.stem, most),
+            *indent_lines(body),
+            *language.close_parts(),
+        ]
+        arrays = [program.array_names[state.name] for state in model.states]
+        copies = [language.assign(f"{name}[step + 1]", f"{name}[step]") for name in arrays]
+        body = [*chain.from_iterable(copies), *parts]
     head = language.open_loop("step", 0, to_last=False)
     return [head, *indent_lines(body), *language.close_loop()]
 

@@ -19,6 +19,7 @@ from sysid.export.program import (
     time_loop,
     write_delay_steps,
 )
+from sysid.kernels.integrators import HALVINGS
 from sysid.language.functions import FUNCTIONS, Level
 from sysid.models.model import ModelSignal, Output
 from sysid.simulation.grid import GRID_TOLERANCE
@@ -29,7 +30,7 @@ _RESERVED_WORDS = (
     "with match case type np t simulate rates step steps part dt h k now slope_1 slope_2 slope_3 "
     "slope_4 every points ratio ramp half width averaged averaged_on_grid sample_time range zip "
     "map max min int float abs len between between_on_grid held past lately grid print math erf "
-    "pchip pchip_slope slice ValueError"
+    "pchip pchip_slope slice ValueError sides find_switch begin end behind duration number"
 )
 _LINE_WIDTH = 96
 
@@ -102,6 +103,19 @@ class PythonLanguage(TargetLanguage):
         """Return nothing: the loop ends with its indentation."""
         return []
 
+    def open_parts(self, stem: str, most: int) -> list[str]:
+        """Write the first lines of a loop over the parts of a step."""
+        return [
+            "begin, number = 0.0, 0",
+            "while begin < 1.0:",
+            f"    end, behind = find_switch(step, begin) if number < {most} else (1.0, 1.0)",
+            "    duration = (end - begin)*dt",
+        ]
+
+    def close_parts(self) -> list[str]:
+        """Write the step to the next part."""
+        return ["    begin, number = behind, number + 1"]
+
 
 def write_python_source(identified: IdentifiedModel) -> str:
     """Write a module with one function ``simulate(t, u, …) -> y``.
@@ -113,7 +127,11 @@ def write_python_source(identified: IdentifiedModel) -> str:
     """
     language = PythonLanguage()
     program = GeneratedProgram(identified, language, Identifiers(_RESERVED_WORDS.split()))
-    loop = [*time_loop(program, _write_runge_kutta), *_write_outputs(program)]
+    loop = [
+        *_write_switches(program),
+        *time_loop(program, _write_runge_kutta),
+        *_write_outputs(program),
+    ]
     head = [
         *_write_arrays(program),
         *_write_step_count(program),
@@ -278,7 +296,7 @@ def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
     now = ", ".join(f"{name}[step]" for name in every)
     following = [f"{name}[step + 1]" for name in every]
     target = ", ".join(following) if len(following) > 1 else f"({following[0]},)"
-    return [
+    lines = [
         f"def rates(step, part, {', '.join(states)}):  # at `part` of a step after it began",
         "    return np.array([",
         *slopes,
@@ -286,6 +304,23 @@ def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
         "",
         "for step in range(steps):",
         f"    now = np.array([{now}])",
+    ]
+    if program.sides:
+        parts = [
+            *program.language.open_parts(program.stem, len(program.sides)),
+            "    slope_1 = rates(step, begin, *now)",
+            *_write_first_rises(program),
+            "    slope_2 = rates(step, 0.5*(begin + end), *(now + duration/2*slope_1))",
+            "    slope_3 = rates(step, 0.5*(begin + end), *(now + duration/2*slope_2))",
+            "    slope_4 = rates(step, end, *(now + duration*slope_3))",
+            *indent_lines(program.assign_rises("last", "slope_4")),
+            "    now = now + duration/6*(slope_1 + 2*slope_2 + 2*slope_3 + slope_4)",
+            *program.language.close_parts(),
+            f"{target} = now",
+        ]
+        return [*lines, *indent_lines(parts)]
+    return [
+        *lines,
         "    slope_1 = rates(step, 0.0, *now)",
         *indent_lines(program.assign_rises("first", "slope_1")),
         "    slope_2 = rates(step, 0.5, *(now + dt/2*slope_1))",
@@ -297,6 +332,38 @@ def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
                 f"{target} = ", "now + dt/6*(slope_1 + 2*slope_2 + 2*slope_3 + slope_4)"
             )
         ),
+    ]
+
+
+def _write_first_rises(program: GeneratedProgram) -> list[str]:
+    """Write the rises by the first slope of a step, in its first part."""
+    rises = program.assign_rises("first", "slope_1")
+    return ["    if number == 0:", *indent_lines(rises, 2)] if rises else []
+
+
+def _write_switches(program: GeneratedProgram) -> list[str]:
+    """Write the functions that find the switches in time of a step; none if there are none."""
+    if not program.sides:
+        return []
+    sides = [_wrap_statement("", side, ",") for side in program.write_sides()]
+    return [
+        "def sides(step, part):  # whole numbers, each of which changes at a switch in time",
+        "    return np.array([",
+        *indent_lines([line for side in sides for line in side], 2),
+        "    ])",
+        "",
+        "def find_switch(step, begin):  # just before and just behind the next one in a step",
+        "    before, low, high = sides(step, begin), begin, 1.0",
+        "    if np.array_equal(before, sides(step, high)):",
+        "        return high, high",
+        f"    for _ in range({HALVINGS}):",
+        "        middle = 0.5*(low + high)",
+        "        if np.array_equal(before, sides(step, middle)):",
+        "            low = middle",
+        "        else:",
+        "            high = middle",
+        "    return low, high",
+        "",
     ]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.core.errors import DivergedEverywhere, NothingIdentifiable
 from sysid.core.jit import read_clock
-from sysid.core.settings import GeneticAlgorithm
+from sysid.core.settings import GeneticAlgorithm, StartKind
 from sysid.core.threads import use_one_thread
 from sysid.data.records import find_common_sample_time
 from sysid.identifiability.exchange import describe_exchanges
@@ -44,6 +44,7 @@ from sysid.judgement.preparation import (
 from sysid.judgement.process_order import compare_orders, find_other_orders
 from sysid.judgement.residual_context import find_delay_parameters
 from sysid.judgement.settling import find_rough_end, find_unsettled
+from sysid.judgement.starts import StartComparison, find_open_starts
 from sysid.judgement.unrecorded_input import find_unrecorded_input
 from sysid.judgement.unstable_run import (
     compare_one_step,
@@ -184,10 +185,11 @@ def _build_identification(
             *find_contradictions(problem, metrics, validated, estimates),
             *find_misled_run(estimates, ahead),
             *select_explanations(
-                () if is_of_the_solver else explained.findings,
+                () if is_of_the_solver or feedback else explained.findings,
                 [
                     *find_other_orders(orders, problem.model.name, estimates),
                     *find_other_readings(problem, holds, doubts, estimates, rms),
+                    *find_open_starts(best.starts, estimates),
                 ],
             ),
             *find_ambiguous(estimates),
@@ -246,7 +248,7 @@ def _build_identification(
         ),
         evaluations=state.evaluations + budget.spent,
         generations=max(island.generation for island in state.islands),
-        islands=_summarise_islands(state, best.ends),
+        islands=_summarise_islands(best.state, best.ends),
         identifiability=_describe_identifiability(uncertainty),
         criteria=analysis.criteria,
         correlation=None
@@ -274,11 +276,13 @@ def _build_identification(
         order_comparison=orders,
         delays=tuple(sorted(delays)),
         findings=findings,
+        explained=explained.is_done,
         verdict=conclude_verdict(analysis.estimates, findings, declared),
         warnings=list_warnings(findings),
         substeps=problem.model.solver.substeps,
+        initial=_get_start(asked, best.starts),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
-        history=_extend_histories(state, best.ends),
+        history=_extend_histories(best.state, best.ends),
         migrations=state.migrations,
         simulated=split_outputs(problem, simulated),
         simulated_validation=() if validated is None else validated.simulated,
@@ -290,6 +294,14 @@ def _describe_identifiability(uncertainty: Uncertainty | None) -> Identifiabilit
     if uncertainty is None:
         return Identifiability(None, (), np.zeros(0))
     return Identifiability(uncertainty.condition, uncertainty.groups, uncertainty.singular_values)
+
+
+def _get_start(asked: Problem, starts: StartComparison | None) -> StartKind | None:
+    """Get the start that the estimates assume; None for that of the model's document."""
+    if starts is not None:
+        return starts.own.name
+    initial = asked.settings.initial
+    return None if initial == "auto" else initial
 
 
 def _compute_input_history(problem: Problem) -> tuple[float, ...]:

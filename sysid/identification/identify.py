@@ -23,7 +23,7 @@ from sysid.identification.request import IdentificationRequest, accept_fields
 from sysid.identification.run import advance_run, begin_run, is_finished
 from sysid.islands.run_state import RunState
 from sysid.judgement.agreement import find_constant_outputs
-from sysid.judgement.conclusions import list_warnings
+from sysid.judgement.conclusions import add_reading_notes, list_warnings
 from sysid.models.catalogue.load import resolve_model
 from sysid.models.model import Model
 from sysid.models.model_delays import check_unused_settings
@@ -72,6 +72,10 @@ def identify(request: IdentificationRequest) -> Identification:
         residual counts by the variance that the noise has in its output and its experiment.
     skip : int
         Number of first samples of each output that are not compared.
+    initial : {"rest", "free", "measured", "auto"}
+        Where the states start: at rest under the first inputs, at estimated or at measured values.
+        ``"auto"`` compares them by the data. Default: as the model's document says, which is
+        ``auto`` for processes with dead time.
     validation : Record, Recording, table, or sequence of them
         Data that are not used for the estimate.
     validation_fraction : float
@@ -125,7 +129,14 @@ def identify(request: IdentificationRequest) -> Identification:
         model,
         read.records,
         request.settings or GeneticAlgorithm(),
-        FitSettings(changes, request.prediction, loss, request.weights, request.skip),
+        FitSettings(
+            changes,
+            request.prediction,
+            loss,
+            request.weights,
+            request.skip,
+            request.initial,
+        ),
         request,
         validation=(
             None
@@ -135,9 +146,9 @@ def identify(request: IdentificationRequest) -> Identification:
         progress=request.progress,
     )
     assert result.data is not None
-    notes = (rewrite_settings(note, write_setting) for note in result.warnings)
+    warnings = tuple(rewrite_settings(note, write_setting) for note in result.warnings)
     data = replace(result.data, channels=read.channels)
-    return replace(result, warnings=(*read.notes, *notes), data=data)
+    return add_reading_notes(replace(result, warnings=warnings, data=data), read.notes)
 
 
 def _read_data(

@@ -6,12 +6,16 @@ never make a verdict milder, nor a status.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE
-from sysid.results.findings import Finding, Severity
+from sysid.results.findings import Finding, Severity, note
 from sysid.results.verdict import Verdict
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
+
+if TYPE_CHECKING:
+    from sysid.results.identification import Identification
 
 _MOST_REASONS = 2  # of an estimate, and in a verdict
 
@@ -129,6 +133,12 @@ def _list_causes(first: Finding, severe: Sequence[Finding]) -> list[str]:
     return list(dict.fromkeys(one.brief for one in (severe[0], worst, *notes, *severe)))[
         :_MOST_REASONS
     ]
+
+
+def add_reading_notes(found: "Identification", texts: Sequence[str]) -> "Identification":
+    """Add to a result what was noted when its recording was read, after what was found."""
+    notes = [note("recording", "record", text) for text in texts]
+    return replace(found, findings=(*found.findings, *notes), warnings=(*found.warnings, *texts))
 
 
 def list_warnings(findings: Sequence[Finding]) -> tuple[str, ...]:

@@ -152,13 +152,19 @@ def find_other_readings(
                 f"{hold.input} may be read {_READINGS[str(hold.other)]}",
                 f"input {hold.input!r} {hold.reason}, so it is read {_READINGS[hold.chosen]}. Read "
                 f"{other} it would give {would}.{f' {doubt}.' if doubt else ''}",
-                f"Use {write_hold(hold)}." if evidence > DEFECT_GAIN else "",
+                f"Use {write_hold(hold)}."
+                if evidence > DEFECT_GAIN and _is_regular(hold.input, problem.records)
+                else "",
                 evidence,
                 tuple(moves),
                 tuple(outside) if doubt else (),
             )
         if hold.chosen == "zero" and hold.other is not None:
             yield from _find_uncertain_jumps(hold.input, problem.records)
+
+
+def _is_regular(name: str, records: Sequence[Record]) -> bool:
+    return all(channel.sampling.is_regular for channel in _find_channels(name, records))
 
 
 def _list_moves(hold: InputHold, estimates: Sequence[Estimate]) -> list[Move]:

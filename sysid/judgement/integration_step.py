@@ -255,7 +255,7 @@ def _can_halve(problem: Problem) -> bool:
 
 def _halve_step(problem: Problem) -> Problem:
     """Make the same problem with half the integration step."""
-    model = problem.untied_model
+    model = problem.given_model
     return problem.rebuild(model=replace_substeps(model, _FACTOR * model.solver.substeps))
 
 

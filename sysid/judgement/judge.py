@@ -1,23 +1,33 @@
 """The judge: which explanations of the residuals are more likely than noise, and what they move."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.text import plain_estimate, plain_unit
+from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import FloatArray
-from sysid.judgement.explanations import actuator, constancy, history, reading, sensor, structure
+from sysid.judgement.explanations import (
+    actuator,
+    constancy,
+    history,
+    numerics,
+    reading,
+    sensor,
+    structure,
+)
 from sysid.judgement.explanations.noise import (
     find_disagreement_of_frequencies,
     find_noise,
 )
-from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE, STRONG_ODDS
+from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE, STRONG_ODDS, UNLIKELY_MOVE
 from sysid.judgement.residual_context import Candidate, ResidualContext
 from sysid.judgement.residual_model import ColumnFit
 from sysid.results.findings import Finding, Move
 
 _PROPOSERS = (
+    numerics.propose,
     constancy.propose,
     sensor.propose,
     structure.propose,
@@ -79,6 +89,8 @@ def explain_residuals(context: ResidualContext) -> Explained:
             and one.candidate.explanation != best.candidate.explanation
         ]
         findings.append(_describe(context, best, base, rivals))
+        if best.moves is not None:
+            break  # the estimate is another one then
         taken = np.hstack([taken, best.candidate.columns])
         counted += best.candidate.counted
         base = best.fit
@@ -143,7 +155,39 @@ def _refit_finalists(
         gain = criterion - found.criterion - used
         if gain > one.gain - STRONG_ODDS:
             refitted[position] = one._replace(gain=max(gain, one.gain), moves=found.moves)
-    return sorted(refitted, key=lambda one: -one.gain)
+    parted = _part_finalist(context, scored, criterion)
+    return sorted([*refitted, *parted], key=lambda one: -one.gain)
+
+
+def _part_finalist(
+    context: ResidualContext, scored: Sequence[_Scored], criterion: float
+) -> list[_Scored]:
+    """Fit both sides of the likeliest moment of a change by themselves."""
+    likeliest = next((one for one in scored if one.candidate.moment is not None), None)
+    if likeliest is None or likeliest.gain <= 0.0:
+        return []
+    moment = likeliest.candidate.moment or 0.0
+    found = context.refit_parts(moment)
+    if found is None:
+        return []
+    gain = criterion - found.criterion
+    changed = [one for one in found.changes if one[0] > UNLIKELY_MOVE][:_MOST_TOLD]
+    if not changed or gain < likeliest.gain + STRONG_ODDS:
+        return []
+    names = join_names([name for _, name, _, _ in changed])
+    verb = "change" if len(changed) > 1 else "changes"
+    told = ", ".join(f"{name} from {a:.4g} to {b:.4g}" for _, name, a, b in changed)
+    is_lag = changed[0][1] in context.delays
+    candidate = replace(
+        likeliest.candidate,
+        explanation="change of a time lag" if is_lag else "change of a parameter",
+        family="constancy",
+        brief=f"{names} {verb} at about {moment:.4g} s",
+        text=f"at about {moment:.4g} s {names} {verb}, or what is measured does: {told}",
+        advice="Identify both parts by themselves: give each a label in a column for --segments.",
+        describe=None,
+    )
+    return [_Scored(candidate, likeliest.fit, gain, found.moves)]
 
 
 def _describe(

@@ -12,9 +12,10 @@ from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.core.units import format_unit
 from sysid.data.interpolation import interpolate_channel
 from sysid.data.records import Channel, Record
-from sysid.judgement.fixed_start import compute_start_slopes, list_fixed_starts
 from sysid.judgement.residual_model import ColumnFit, Noise, ResidualModel
+from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.kernels.signals.past_reads import list_delayed_values
+from sysid.models.model import Model
 from sysid.models.ties import collect_parameter_names
 from sysid.residuals.series import ResidualPart, iterate_parts
 from sysid.results.findings import Family, Move
@@ -48,6 +49,8 @@ class Candidate:
     varies : tuple of int and two floats, or None
         Number of the parameter that is not one value, and the least and largest share of the last
         coefficient that is added to it.
+    moment : float or None
+        Where something changes, s.
     records : sequence of Record, or None
         Records with which the model is fitted again, for moves that are not linear.
     is_vague : bool
@@ -63,6 +66,7 @@ class Candidate:
     counted: int = 0
     describe: Callable[[ColumnFit], str] | None = None
     varies: tuple[int, float, float] | None = None
+    moment: float | None = None
     records: Sequence[Record] | None = None
     is_vague: bool = False
 
@@ -195,11 +199,82 @@ class ResidualContext:
         )
         return Refitted(fit.criterion, moves)
 
-    def simulate(self, records: Sequence[Record]) -> FloatArray:
-        """Simulate the scored values (n,) with other inputs."""
-        return self._predict(
-            self.problem.rebuild(records=records, weights=self.problem.output_weights)
-        )
+    def refit_parts(self, moment: float) -> "Parted | None":
+        """Fit the model to both parts of a record by themselves; None if that fails.
+
+        Both have parameters of their own, and the states may jump between them (Chow, Econometrica
+        28 (1960) 591). Moves are those to the value that is further away.
+        """
+        is_late = self.times >= moment
+        d, n = self.theta.size, self.times.size
+        if len(self.problem.records) > 1 or min(is_late.sum(), (~is_late).sum()) < 4 * d:
+            return None
+        points, columns, residuals = [], [], np.zeros(n)
+        for is_part in (~is_late, is_late):
+            problem = self._leave_out(~is_part)
+            (end,) = refine_candidates(problem, [self.theta], _REFIT_STEPS * (d + 1))
+            if end is None:
+                return None
+            slopes = compute_sensitivities(self.problem, end.theta)
+            self.spent.extend([1] * (end.evaluations + slopes.evaluations))
+            residuals[is_part] = -slopes.residuals[is_part]
+            columns.append(np.where(is_part[:, None], slopes.columns, 0.0))
+            points.append(end.theta)
+        jumps = [self.shift_start(one, int(np.argmax(is_late))) for one in self.start_slopes]
+        design = np.column_stack([*columns, *jumps])
+        fit = ResidualModel(residuals, design, self.parts).without
+        used = design.shape[1] - d + 1
+        scales = [compute_physical_scale(self.problem, point) for point in points]
+        values = [
+            point + fit.coefficients[k * d : (k + 1) * d] * scales[k]
+            for k, point in enumerate(points)
+        ]
+        errors = [fit.errors[k * d : (k + 1) * d] * scales[k] for k in range(2)]
+        known = {estimate.name: estimate for estimate in self.analysis.estimates}
+        moves, changes = [], []
+        for number, name in self.declared:
+            stderr = known[name].stderr
+            if not stderr:
+                continue
+            away = [float(value[number] - self.theta[number]) / stderr for value in values]
+            far = int(np.argmax(np.abs(away)))
+            value, error = float(values[far][number]), float(errors[far][number])
+            moves.append(Move(name, value, error, away[far]))
+            change = float(values[1][number] - values[0][number])
+            size = abs(change) / max(float(np.hypot(*(e[number] for e in errors))), 1e-300)
+            changes.append((size, name, float(values[0][number]), float(values[1][number])))
+        criterion = fit.criterion + used * np.log(max(n, 2))
+        return Parted(criterion, _order_moves(moves), tuple(sorted(changes, reverse=True)))
+
+    def _leave_out(self, rows: BoolArray) -> Problem:
+        """Leave scored samples (n,) out of the residuals of least squares."""
+        weight = self.problem.evaluator.weight.copy()
+        weight[self.problem.scored_rows[rows]] = 0.0
+        return replace(self.problem, evaluator=self.problem.evaluator._replace(weight=weight))
+
+    @cached_property
+    def start_slopes(self) -> list[FloatArray]:
+        """Slopes (n,) of the outputs in the start of each state, estimated or not."""
+        declared = {number for number, _ in self.declared}
+        columns = self.residual_model.columns
+        own = [columns[:, d] for d in range(self.theta.size) if d not in declared]
+        own += [np.sum(slopes, axis=1) for slopes in self.fixed_start_slopes]
+        return [column for column in own if column.any()]
+
+    def shift_start(self, slope: FloatArray, position: int) -> FloatArray:
+        """Let the effect (n,) of a start begin at a sample: that of a jump of the state there."""
+        part = next(p for p in self.parts if p.rows.start <= position < p.rows.stop)
+        shifted = np.zeros(slope.size)
+        length = part.rows.stop - position
+        shifted[position : part.rows.stop] = slope[part.rows][:length]
+        return shifted
+
+    def simulate(
+        self, records: Sequence[Record] | None = None, model: Model | None = None
+    ) -> FloatArray:
+        """Simulate the scored values (n,) with other inputs or another model."""
+        weights = self.problem.output_weights
+        return self._predict(self.problem.rebuild(records=records, model=model, weights=weights))
 
     def replace_input(
         self, name: str, change: Callable[[FloatArray], FloatArray], **fields: object
@@ -229,7 +304,7 @@ class ResidualContext:
 
         Not of predictions one step ahead, which forget their start.
         """
-        states = list_fixed_starts(self.problem)
+        states = list_assumed_starts(self.problem)
         if self.problem.prediction != "simulation" or len(states) > _MOST_STATES:
             return []
         noise = float(np.sqrt(np.mean(np.square(self.residual_model.residuals))))
@@ -370,6 +445,17 @@ class Refitted(NamedTuple):
 
     criterion: float
     moves: tuple[Move, ...]
+
+
+class Parted(NamedTuple):
+    """A model fitted to both parts of a record: criterion, moves, changes from part to part.
+
+    Changes are by size: in errors of the difference, the parameter, its values before and after.
+    """
+
+    criterion: float
+    moves: tuple[Move, ...]
+    changes: tuple[tuple[float, str, float, float], ...]
 
 
 def _order_moves(moves: Iterable[Move]) -> tuple[Move, ...]:

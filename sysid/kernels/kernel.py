@@ -1,5 +1,6 @@
 """Code generation of a kernel: blocks of individuals, a time loop in each, and the loss."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from llvmlite import ir
@@ -216,10 +217,13 @@ def _bind_environment(
     """Bind the environment of this step; its positions and the states' values stay open."""
 
     def build_environment(
-        halves: int, values: dict[str, IrValue], equation: int = 0
+        halves: int,
+        values: dict[str, IrValue],
+        equation: int = 0,
+        parts: Mapping[int, IrValue] | None = None,
     ) -> StepEnvironment:
         return StepEnvironment(
-            lanes, model, scope, states, signals, time_step, halves, values, equation
+            lanes, model, scope, states, signals, time_step, halves, values, equation, parts
         )
 
     return build_environment

@@ -6,10 +6,12 @@ parameter. Statuses, verdict and warnings follow from the findings in one place,
 `sysid.judgement.conclusions`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from sysid.uncertainty.estimates import EstimateStatus
+from sysid.core.text import join_names
+from sysid.uncertainty.estimates import Estimate, EstimateStatus
 
 Severity = Literal["note", "caution", "serious"]
 Family = Literal[
@@ -113,3 +115,20 @@ def note(explanation: str, family: Family, text: str) -> Finding:
     'note'
     """
     return Finding(explanation, family, "note", explanation, text)
+
+
+def list_untold_reasons(estimates: Sequence[Estimate], findings: Sequence[Finding]) -> list[str]:
+    """List the reasons of statuses that no finding tells, each once with its parameters.
+
+    Examples
+    --------
+    >>> lag = Estimate("L", "s", 5.0, 0.0, 5.0, None, None, "fixed", "it was fixed")
+    >>> list_untold_reasons([lag], [])
+    ['L: it was fixed']
+    """
+    told = {name for one in findings for name in one.parameters}
+    names: dict[str, list[str]] = {}
+    for estimate in estimates:
+        if estimate.reason and estimate.name not in told:
+            names.setdefault(estimate.reason, []).append(estimate.name)
+    return [f"{join_names(some)}: {reason}" for reason, some in names.items()]

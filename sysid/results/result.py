@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from sysid.core.errors import InvalidRecord
-from sysid.core.settings import LossKind, PredictionKind
+from sysid.core.settings import LossKind, PredictionKind, StartKind
 from sysid.core.text import find_rms_unit
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
@@ -165,6 +165,9 @@ class Result:
         Free parameters that time lags depend on.
     findings : tuple of Finding
         What explains the residuals, and what speaks against the estimates; the most severe first.
+    explained : bool
+        Whether explanations of the residuals were looked for. In a sweep they are not, until a run
+        is opened.
     verdict : Verdict
         Whether the estimates can be relied on.
     warnings : tuple of str
@@ -173,6 +176,8 @@ class Result:
         Integration steps in one grid step: the model's, or more.
     selection : tuple of SelectedTerm
         Selected terms; empty if none were to be selected.
+    initial : StartKind or None
+        Start of the states that the estimates assume; none: as the model's document says.
     """
 
     valid: bool
@@ -202,10 +207,12 @@ class Result:
     order_comparison: OrderComparison | None
     delays: tuple[str, ...]
     findings: tuple[Finding, ...]
+    explained: bool
     verdict: Verdict
     warnings: tuple[str, ...]
     substeps: int
     selection: tuple[SelectedTerm, ...]
+    initial: StartKind | None = None
 
     @property
     def parameter_values(self) -> dict[str, float]:

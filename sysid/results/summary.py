@@ -14,12 +14,12 @@ from sysid.core.text import (
     plain_unit,
 )
 from sysid.core.value_documents import list_fields
-from sysid.residuals.residual_tests import ResidualTests
+from sysid.results.findings import list_untold_reasons
 from sysid.results.parts import OrderComparison, SearchEvidence
-from sysid.results.result import FullResult, find_output_unit
+from sysid.results.result import FullResult, Result, find_output_unit
 from sysid.uncertainty.estimates import Estimate
 
-_MAX_WARNINGS = 3
+_MAX_NOTES = 3
 _BECAUSE = {
     "starts": "the search settled",
     "residuals": "the search settled, as nothing but noise is left",
@@ -28,7 +28,7 @@ _BECAUSE = {
 
 
 def summarise_result(result: FullResult) -> str:
-    """Summarise a result in a few lines: estimates, fit, verdicts, the first warnings."""
+    """Summarise a result in a few lines: verdict, estimates, evidence, the first notes."""
     lines = [", ".join(_list_facts(result)), f"verdict: {result.verdict.text}"]
     rows = [
         (
@@ -40,17 +40,16 @@ def summarise_result(result: FullResult) -> str:
         for estimate in result.parameters
     ]
     lines += [f"  {'  '.join(cells).rstrip()}" for cells in _align_columns(rows)]
-    lines += _list_verdicts(result)
-    shown = result.warnings[:_MAX_WARNINGS]
-    lines += [f"note: {warning}" for warning in shown]
-    left = len(result.warnings) - len(shown)
-    if left > 0:
-        lines.append(f"and {left} more in `warnings`")
+    lines += _list_checks(result)
+    notes = _list_notes(result)
+    lines += [f"note: {text}" for text in notes[:_MAX_NOTES]]
+    if notes[_MAX_NOTES:]:
+        lines.append(f"and {len(notes) - _MAX_NOTES} more in `warnings`")
     return "\n".join(lines)
 
 
 def to_html(result: FullResult) -> str:
-    """Write a result as HTML: estimates, fit, verdicts, all warnings."""
+    """Write a result as HTML: verdict, estimates, evidence, all notes."""
     head = "".join(
         f"<th style='text-align:left'>{name}</th>"
         for name in ("Parameter", "Estimate", "Unit", "95 % interval", "Status")
@@ -61,14 +60,14 @@ def to_html(result: FullResult) -> str:
         for text in [
             ", ".join(_list_facts(result)),
             f"verdict: {result.verdict.text}",
-            *_list_verdicts(result),
+            *_list_checks(result),
         ]
     )
-    warnings = "".join(f"<li>{escape(warning)}</li>" for warning in result.warnings)
-    notes = f"<details open><summary>Warnings</summary><ul>{warnings}</ul></details>"
+    notes = "".join(f"<li>{escape(text)}</li>" for text in _list_notes(result))
+    details = f"<details open><summary>Notes</summary><ul>{notes}</ul></details>"
     return (
         f"<div><p>{facts}</p><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
-        f"{notes if warnings else ''}</div>"
+        f"{details if notes else ''}</div>"
     )
 
 
@@ -100,19 +99,32 @@ def _list_columns(estimate: Estimate) -> Iterator[tuple[str, object]]:
             yield field.name, getattr(estimate, field.name)
 
 
-def describe_residuals(tests: ResidualTests) -> str:
+def list_evidence(result: Result) -> list[str]:
+    """List the evidence beside the findings: residual tests, and the order if none tells it."""
+    evidence = [describe_residuals(result)] if result.residual_tests.passed is not None else []
+    if result.order_comparison is not None and not any(
+        one.severity != "note" or one.explanation == "order" for one in result.findings
+    ):
+        evidence.append(describe_order(result.order_comparison))
+    return evidence
+
+
+def describe_residuals(result: Result) -> str:
     """Say whether the residuals pass their tests; failed tests have their p-value.
 
-    Warnings cover only p < 0.001, so most failed tests are reported only here.
+    Beside a verdict without a condition, a failed test is followed by why it changes nothing.
     """
+    tests = result.residual_tests
     failed = [
         f"{test.output} {'is not white' if test.input is None else f'depends on {test.input}'}"
         + ("" if test.p is None else f" (p = {test.p:.2g})" if test.p >= 1e-3 else " (p < 0.001)")
         for test in tests.tests
         if test.outcome == "failed"
     ]
-    verdict = f"failed: {', '.join(dict.fromkeys(failed))}" if failed else "passed"
-    return f"residuals on {tests.data} data: {verdict}"
+    outcome = f"failed: {', '.join(dict.fromkeys(failed))}" if failed else "passed"
+    if failed and result.verdict.trust == "trustworthy":
+        outcome += "; no explanation of that moves an estimate" if result.explained else ", weakly"
+    return f"residuals on {tests.data} data: {outcome}"
 
 
 def describe_search(evidence: SearchEvidence) -> str:
@@ -122,20 +134,32 @@ def describe_search(evidence: SearchEvidence) -> str:
 
 
 def describe_order(comparison: OrderComparison) -> str:
-    """Say which order the data prefer, and the dead time with those that matter.
+    """Say which order the data prefer, and the dead time with others that are open.
 
-    These are the model's own and all that are open.
+    That of the model itself stands in the table of estimates.
     """
-    unit, open_fits = plain_unit(comparison.unit), comparison.open_fits
-    listed = [fit for fit in comparison.fits if fit.model == comparison.model or fit in open_fits]
-    delays = ", ".join(
-        f"{plain_estimate(fit.delay, fit.delay_stderr)}{unit} with {fit.model}" for fit in listed
-    )
+    others = [fit for fit in comparison.open_fits if fit.model != comparison.model]
     preferred = comparison.preferred_model
-    fits = open_fits if preferred is None else comparison.fits
-    others = " and ".join(fit.model for fit in fits if fit.model != preferred)
-    verdict = "do not tell {} apart" if preferred is None else f"prefer {preferred} to {{}}"
-    return f"order: the data {verdict.format(others)}; {comparison.delay} is {delays}"
+    fits = comparison.open_fits if preferred is None else comparison.fits
+    names = " and ".join(fit.model for fit in fits if fit.model != preferred)
+    told = f"prefer {preferred} to {names}" if preferred else f"do not tell {names} apart"
+    delays = ", ".join(
+        f"{plain_estimate(fit.delay, fit.delay_stderr)}{plain_unit(comparison.unit)} with "
+        f"{fit.model}"
+        for fit in others
+    )
+    return f"order: the data {told}" + (f"; {comparison.delay} is {delays}" if delays else "")
+
+
+def _list_checks(result: Result) -> list[str]:
+    """List the evidence, and that the search settled; a finding tells that it did not."""
+    settled = [describe_search(result.search)] if result.search.settled else []
+    return [*list_evidence(result), *settled]
+
+
+def _list_notes(result: FullResult) -> list[str]:
+    """List what is noted: the warnings, and reasons of statuses that none of them tells."""
+    return [*result.warnings, *list_untold_reasons(result.parameters, result.findings)]
 
 
 def _list_facts(result: FullResult) -> Iterator[str]:
@@ -155,15 +179,6 @@ def _format_fit(fit: float) -> str:
     return f"{fit:.2f} %" if isfinite(fit) else "undefined"
 
 
-def _list_verdicts(result: FullResult) -> list[str]:
-    verdicts = [] if result.valid else ["the model is invalid: its RMS is above the safe limit"]
-    if result.residual_tests.passed is not None:
-        verdicts.append(describe_residuals(result.residual_tests))
-    if result.order_comparison is not None:
-        verdicts.append(describe_order(result.order_comparison))
-    return [*verdicts, describe_search(result.search)]
-
-
 def _align_columns(rows: Sequence[tuple[str, ...]]) -> Iterator[list[str]]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
@@ -172,12 +187,11 @@ def _align_columns(rows: Sequence[tuple[str, ...]]) -> Iterator[list[str]]:
 
 def _write_cells(estimate: Estimate) -> str:
     interval = format_interval(estimate.interval95, estimate.stderr, status=estimate.status) or DASH
-    why = f" <small>{escape(estimate.reason)}</small>" if estimate.reason else ""
     cells = (
         f"<b>{escape(estimate.name)}</b>",
         escape(join_estimate(estimate.value, estimate.stderr, status=estimate.status)),
         "" if estimate.unit == "1" else escape(estimate.unit),
         escape(interval),
-        f"{escape(estimate.status)}{why}",
+        escape(estimate.status),
     )
     return "".join(f"<td style='text-align:left'>{cell}</td>" for cell in cells)

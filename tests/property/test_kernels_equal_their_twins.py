@@ -122,6 +122,32 @@ def test_a_history_function_equals_its_twin(method: str, interpolation: str, ste
         assert_equal(Problem.build(model, [record(24)], prediction="one-step"), one_step=True)
 
 
+SWITCHING = {
+    "x": "where(t > c and t < c + L, sqrt(t - c), where(mod(t - L, 0.2*c + 0.11) <= 0.1, v, 0)) + u"
+    " - b*x(t - 0.5*L)",
+    "v": "max(t - c, 0, x)*sign(c - t) + abs(t - 2*L) + floor(3*t) + clip(t, L, c) - v(t - L)"
+    " + u(t - L) + table(t - L, [0, 0.2, 0.5], [0, b, 1]) + pchip(t, [0.33, 0.77], [c, 0]) - x",
+}
+
+
+@pytest.mark.parametrize("method", ["rk4", "euler", "semi-implicit"])
+@pytest.mark.parametrize(
+    ("interpolation", "step", "hold"),
+    [("linear", "sample", "zero"), ("cubic", 0.017, "first"), ("nearest", 0.034, "zero")],
+)
+def test_a_step_divided_at_switches_in_time_equals_its_twin(
+    method: str, interpolation: str, step: Any, hold: Any
+) -> None:
+    solver = {"method": method, "interpolation": interpolation, "step": step, "substeps": 2}
+    history = {"v": "where(t < -0.1, c, sin(9*t)) + 0.3"}
+    model = differential(
+        SWITCHING, "x(t-L) + v", solver=solver, history=history, initial={"x": 0.3}
+    )
+    assert_equal(Problem.build(model, [record(16, hold=hold)]))
+    if interpolation == "linear":
+        assert_equal(Problem.build(model, [record(16)], prediction="one-step"), one_step=True)
+
+
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 def test_one_step_prediction_equals_its_twin(interpolation: str) -> None:
     model = difference(RECURSION, "x", solver={"interpolation": interpolation})

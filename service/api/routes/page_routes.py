@@ -102,21 +102,24 @@ def job_page(
     job_id: str,
     request: Request,
     session: ReadSession,
+    parts: PartsDep,
     cursor: Cursor = None,
     cell: CellFilter = None,
     outliers: OutlierRule = "exclude",
 ) -> Response:
     """Show a job with its runs, or the grid of its cells and the runs of the chosen cell."""
-    url = str(request.base_url)
+    url, store = str(request.base_url), parts.store
     return HtmlPage(
-        job_pages.job_page(session, job_id, url, cursor=cursor, cell=cell or [], outliers=outliers)
+        job_pages.job_page(
+            session, store, job_id, url, cursor=cursor, cell=cell or [], outliers=outliers
+        )
     )
 
 
 @router.get("/runs/{run_id}", **HIDDEN)
-def run_page(run_id: str, request: Request, session: ReadSession) -> Response:
+def run_page(run_id: str, request: Request, session: ReadSession, parts: PartsDep) -> Response:
     """Show the job of a run, with this run in full."""
-    return HtmlPage(job_pages.run_page(session, run_id, str(request.base_url)))
+    return HtmlPage(job_pages.run_page(session, parts.store, run_id, str(request.base_url)))
 
 
 @router.get("/runs/{run_id}/simulate", **HIDDEN)

@@ -54,10 +54,13 @@ router = APIRouter(prefix="/v1/runs", tags=["runs"], route_class=JsonRoute)
 
 
 @router.get("/{run_id}")
-def read_run(run_id: str, session: ReadSession, response: Response) -> RunOut:
-    """Read one run: its state, and its result as soon as it exists."""
+def read_run(run_id: str, session: ReadSession, parts: PartsDep, response: Response) -> RunOut:
+    """Read one run: its state, and its result as soon as it exists.
+
+    The residuals of a sweep's run are explained when it is read here.
+    """
     set_etag(response, RunRepository(session).get(run_id))
-    return runs.get_run(session, run_id)
+    return runs.get_run(session, run_id, parts.store)
 
 
 @router.patch("/{run_id}")

@@ -49,7 +49,6 @@ def render_identification_report(
             "generations": found.generations,
             "seconds": seconds,
             "error": None,
-            "warnings": found.warnings,
             "result": found,
             "model": found.data.model,
         },

@@ -155,7 +155,7 @@ def _build_section(
     run = StoredRunFigures(session, store, stored)
     names: tuple[FigureName, ...] = ("history", "response", "convergence")
     titled = [(TITLES[name], draw_run_figure(run, name)) for name in names]
-    return _ReportSection(why, load_full_run(session, stored), _draw_figures(titled))
+    return _ReportSection(why, load_full_run(session, store, stored), _draw_figures(titled))
 
 
 def _draw_figures(titled: list[tuple[str, Figure]]) -> list[tuple[str, Markup]]:
@@ -190,7 +190,7 @@ def render_job_report(session: Session, store: ObjectStore, job_id: str, base_ur
         trend=None if batch is None else to_trend_view(batch),
         trend_figure=None if batch is None else to_script_json(strip_template(plot_trend(batch))),
         sections=[
-            (load_full_run(session, stored), _run_figures(session, store, stored))
+            (load_full_run(session, store, stored), _run_figures(session, store, stored))
             for stored in full
         ],
         datasets=dataset_links(session, job),

@@ -62,6 +62,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                     change.text,
                     counted=1,
                     records=records,
+                    is_vague=change.family == "input",
                 )
         direct = context.read_input(name)
         yield Candidate(
@@ -161,7 +162,7 @@ def _list_changes(name: str, low: float, high: float, span: float) -> Iterator[_
 
 
 def _list_smoothings(name: str) -> Iterator[_Change]:
-    for width, smooth in product(_WIDTHS, (_smooth, _take_medians)):
+    for width, smooth in product(_WIDTHS, (_smooth, _take_medians, _keep_edges)):
         yield _Change(
             partial(smooth, width=width),
             "noise of an input",
@@ -207,3 +208,15 @@ def _take_medians(values: FloatArray, width: int) -> FloatArray:
     """Take the median of each value's neighbours: noise goes, and jumps stay (Tukey 1977)."""
     padded = np.pad(values, width // 2, mode="edge")
     return np.asarray(np.median(sliding_window_view(padded, width), axis=1))
+
+
+def _keep_edges(values: FloatArray, width: int) -> FloatArray:
+    """Average each value with neighbours that differ by little (bilateral: Tomasi, Manduchi 1998).
+
+    Little is a few deviations of the differences between neighbours.
+    """
+    deviation = 1.4826 * float(np.median(np.abs(np.diff(values)))) / np.sqrt(2.0)
+    padded = np.pad(values, width // 2, mode="edge")
+    windows = sliding_window_view(padded, width)
+    weights = np.exp(-0.5 * ((windows - values[:, None]) / max(3.0 * deviation, 1e-300)) ** 2)
+    return np.asarray(np.sum(weights * windows, axis=1) / np.sum(weights, axis=1))

@@ -33,7 +33,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
         is_lag_a_clock |= is_clock
         subject = f"{name}, or the offset between the clocks," if is_clock else name
         explanation = "change of a time lag" if is_lag else "change of a parameter"
-        for _, late, moment in context.find_breaks(column):
+        for at, late, moment in context.find_breaks(column):
             yield Candidate(
                 explanation,
                 "constancy",
@@ -44,6 +44,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 counted=1,
                 describe=_describe_change(context, number, float(scale[number])),
                 varies=(number, 0.0, 1.0),
+                moment=at,
             )
         yield Candidate(
             "drift of a time lag" if is_lag else "drift of a parameter",
@@ -67,7 +68,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 varies=(number, -0.5, 0.5),
             )
     if not is_lag_a_clock:
-        for _, late, moment in context.find_breaks(clock):
+        for at, late, moment in context.find_breaks(clock):
             yield Candidate(
                 "jump of a clock",
                 "clocks",
@@ -77,6 +78,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 "rows are missing",
                 "Look for lost rows there, and identify both parts by themselves.",
                 counted=1,
+                moment=at,
             )
         yield Candidate(
             "drift of a clock",

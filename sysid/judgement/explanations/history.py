@@ -2,7 +2,8 @@
 
 Before its first sample an input is assumed to be at its first value. What it was instead acts on
 the samples that read it: a column for each of some spans before the record, of one simulation each.
-States that start at a number or at a measured value have the slopes of the outputs as columns.
+States whose start is assumed, at a number, a measured value or a rest, have the slopes of the
+outputs as columns.
 """
 
 from collections.abc import Iterator
@@ -12,10 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.core.errors import SysidError
-from sysid.core.types import FloatArray
 from sysid.data.records import Channel, History, Record
-from sysid.judgement.fixed_start import list_fixed_starts
 from sysid.judgement.residual_context import Candidate, ResidualContext
+from sysid.judgement.start_slopes import list_assumed_starts
 from sysid.judgement.unrecorded_input import compute_reach
 
 _SPANS = 4  # of the time that lags reach back before the record
@@ -28,7 +28,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
         return
     yield from _propose_inputs(context)
     yield from _propose_restarts(context)
-    states, slopes = list_fixed_starts(problem), context.fixed_start_slopes
+    states, slopes = list_assumed_starts(problem), context.fixed_start_slopes
     if slopes:
         yield Candidate(
             "start",
@@ -46,39 +46,25 @@ def _propose_restarts(context: ResidualContext) -> Iterator[Candidate]:
     The effect of a start, begun later, is that of a jump of the states there (innovational outlier:
     Chen and Liu, J. Am. Stat. Assoc. 88 (1993) 284).
     """
-    sources = _list_start_slopes(context)
+    sources = context.start_slopes
     if not sources or len(context.parts) != len(context.problem.records):
         return  # of one output only
     for position in context.find_shocks():
-        part = next(p for p in context.parts if p.rows.start <= position < p.rows.stop)
-        first, stop = part.rows.start, part.rows.stop
-        columns = []
-        for source in sources:
-            column = np.zeros(context.times.size)
-            column[position:stop] = source[first:stop][: stop - position]
-            if column.any():
-                columns.append(column)
-        if columns and position > first:
-            moment = f"{context.times[position]:.4g} s"
+        columns = [context.shift_start(source, position) for source in sources]
+        moved = [column for column in columns if column.any()]
+        if moved and position > 0:
+            moment = float(context.times[position])
             yield Candidate(
                 "jump of the states",
-                "start",
-                np.column_stack(columns),
-                f"the plant jumps at about {moment}",
-                f"at about {moment} the plant is elsewhere at once: by a pulse of a load, rows "
-                "that are missing, or two records in one",
+                "record",
+                np.column_stack(moved),
+                f"the plant jumps at about {moment:.4g} s",
+                f"at about {moment:.4g} s the plant is elsewhere at once: by a pulse of a load, "
+                "rows that are missing, or two records in one",
                 "Identify both parts by themselves: give each a label in a column for --segments.",
                 counted=1,
+                moment=moment,
             )
-
-
-def _list_start_slopes(context: ResidualContext) -> list[FloatArray]:
-    """List the slopes (n,) of the outputs in all starts, estimated or not."""
-    declared = {number for number, _ in context.declared}
-    columns = context.residual_model.columns
-    own = [columns[:, d] for d in range(context.theta.size) if d not in declared]
-    own += [np.sum(slopes, axis=1) for slopes in context.fixed_start_slopes]
-    return [column for column in own if column.any()]
 
 
 def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:

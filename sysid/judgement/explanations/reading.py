@@ -32,6 +32,11 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 _shift_back,
                 "is the mean of the period that ends at its stamp",
             ),
+            "as lines between its changes": (
+                "first",
+                _join_changes,
+                "runs in straight lines from one change to the next",
+            ),
         }
         for word, (hold, change, text) in others.items():
             if change is _keep and hold == channel.effective_hold:
@@ -43,7 +48,8 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 continue
             moved = other - context.simulated
             if np.all(np.isfinite(moved)) and moved.any():
-                setting = f"Use hold: {{{name}: {hold}}}." if change is _keep else ""
+                is_sure = change is _keep and channel.sampling.is_regular
+                setting = f"Use hold: {{{name}: {hold}}}." if is_sure else ""
                 yield Candidate(
                     "reading of an input",
                     "reading",
@@ -114,3 +120,9 @@ def _keep(values: FloatArray) -> FloatArray:
 def _shift_back(values: FloatArray) -> FloatArray:
     """Let each value count from the sample before it on."""
     return np.append(values[1:], values[-1])
+
+
+def _join_changes(values: FloatArray) -> FloatArray:
+    """Join the values at which a held signal changes by straight lines."""
+    changes = np.flatnonzero(np.diff(values, prepend=np.nan) != 0)
+    return np.interp(np.arange(values.size), changes, values[changes])

@@ -17,6 +17,7 @@ _LIMIT_SAMPLES, _LIMIT_SHARE = 5, 0.02  # equal readings at an end of the range
 _HINGES = (0.0, 0.1, 0.2, 0.3)  # of the range, from its end
 _REPEATED_SHARE = 0.2  # of the samples: readings that equal the one before
 _MEANS = (2, 4, 8, 16)  # samples
+_LINE_SHARE, _DRAWN_SHARE = 1e-6, 0.3  # of the range: a bend; of the samples: on lines
 
 
 def propose(context: ResidualContext) -> Iterator[Candidate]:
@@ -25,6 +26,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
         yield from _propose_courses(context, name, rows)
         yield from _propose_curves(context, name, rows, unit)
         yield from _propose_old_readings(context, name, rows)
+        yield from _propose_lines(context, name, rows)
 
 
 def _propose_courses(context: ResidualContext, name: str, rows: BoolArray) -> Iterator[Candidate]:
@@ -47,6 +49,7 @@ def _propose_courses(context: ResidualContext, name: str, rows: BoolArray) -> It
             f"{name} jumps at about {where}, by a step of the sensor or a disturbance",
             "Identify both parts by themselves: give each a label in a column for --segments.",
             counted=1,
+            moment=moment,
         )
         after = np.where((late != 0) & (times >= moment), simulated, 0.0)
         yield Candidate(
@@ -58,6 +61,7 @@ def _propose_courses(context: ResidualContext, name: str, rows: BoolArray) -> It
             "its unit or of its sensor",
             "Convert that part, or identify both parts by themselves.",
             counted=1,
+            moment=moment,
         )
 
 
@@ -100,6 +104,36 @@ def _propose_curves(
                 "Leave these samples out: empty cells are not compared.",
                 counted=1,
             )
+
+
+def _propose_lines(context: ResidualContext, name: str, rows: BoolArray) -> Iterator[Candidate]:
+    """Propose that most readings were interpolated between fewer ones.
+
+    Such readings lie on lines: their second differences vanish, as those of measured ones do not.
+    """
+    drawn, is_drawn = np.zeros(rows.size), False
+    for part in context.parts:
+        measured, simulated = context.measured[part.rows], context.simulated[part.rows]
+        if part.output != name or measured.size < _LIMIT_SAMPLES:
+            continue
+        bends = np.abs(np.diff(measured, 2))
+        is_knot = np.ones(measured.size, dtype=np.bool_)
+        is_knot[1:-1] = bends > _LINE_SHARE * max(float(np.ptp(measured)), 1e-300)
+        is_moving = np.concatenate([[True], np.diff(measured) != 0])
+        is_drawn |= bool(np.mean(~is_knot & is_moving) > _DRAWN_SHARE)
+        times = part.times
+        drawn[part.rows] = np.interp(times, times[is_knot], simulated[is_knot]) - simulated
+    if is_drawn:
+        yield Candidate(
+            "interpolated reading",
+            "record",
+            context.weigh(drawn),
+            f"{name} was interpolated",
+            f"most readings of {name} lie on straight lines between others: they were interpolated "
+            "and are no measurements",
+            f"Keep the measured rows of {name}, and leave the others empty.",
+            is_vague=True,
+        )
 
 
 def _propose_old_readings(

@@ -83,6 +83,7 @@ def compute_kernel_key(model: Model, variant: KernelVariant) -> str:
 def _digest_emitters() -> str:
     """Digest of the code generator: a new version makes new kernels."""
     package = Path(__file__).parents[2]
-    language = (package / "language" / name for name in ("functions.py", "table_functions.py"))
+    names = ("functions.py", "table_functions.py", "time_switches.py")
+    language = (package / "language" / name for name in names)
     sources = (*package.glob("kernels/**/*.py"), *language)
     return digest_files(sources, package)

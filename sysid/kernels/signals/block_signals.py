@@ -18,6 +18,9 @@ from sysid.kernels.vectors import DOUBLE, IrValue, KernelLoop, VectorBuilder
 from sysid.language.tree import Expression, PastValue, Symbol
 from sysid.models.model import Model
 
+_WITH_RISES = 3
+"""Columns of a history of samples with the rises of the steps that end there."""
+
 
 class ExperimentHead:
     """Head of an experiment's numbers, loaded at the kernel's entry."""
@@ -198,12 +201,11 @@ class States:
             self._histories[stored.state, stored.delay] = StateHistory(base, stored.columns)
             first_column += stored.columns
         self.line: dict[str, list[IrValue]] = {}
-        self.with_rises = tuple(
-            dict.fromkeys(name for name, delay in self._histories if delay is not None)
-        )
-        self.first_rises: dict[str, IrValue] = {}
-        self.last_rises: dict[str, IrValue] = {}
+        with_rises = self._histories if past_reads.reads_cubics(model) else {}
+        self.with_rises = tuple(dict.fromkeys(name for name, _ in with_rises))
         level = lanes.splat(lanes.make_number(0.0))  # slope before the start
+        self.first_rises: dict[str, IrValue] = dict.fromkeys(self.with_rises, level)
+        self.last_rises: dict[str, IrValue] = dict.fromkeys(self.with_rises, level)
         self._finished = {
             name: FinishedStep(self._before[name], level, level) for name in self.with_rises
         }
@@ -227,6 +229,11 @@ class States:
             loop = KernelLoop(lanes)
             row = loop.carry(lanes.make_integer(0))
             for (name, _), history in self._histories.items():
+                if history.columns == _WITH_RISES:
+                    index = b.mul(row, lanes.make_integer(lanes.width))
+                    rises = self.first_rises[name], self.last_rises[name]
+                    self._store_row(history, index, (self._before[name], *rises))
+                    continue
                 index = b.mul(row, lanes.make_integer(history.columns * lanes.width))
                 values = [self._before[name]] * history.columns
                 lanes.store_columns(values, history.base, index)
@@ -234,7 +241,7 @@ class States:
             loop.update(row, following)
             loop.leave_if(b.icmp_signed(">=", following, self._reach))
             loop.repeat()
-            self.store_states(self._reach)
+            self._store_finished_step(self._reach)
         return self._reach
 
     def store_states(self, row: IrValue) -> None:
@@ -242,7 +249,27 @@ class States:
         index = self._lanes.builder.mul(row, self._lanes.make_integer(self._lanes.width))
         for (name, delay), history in self._histories.items():
             if delay is None:
-                self._lanes.store_row(self.now[name], history.base, index)
+                self._store_row(history, index, (self.now[name],))
+
+    def _store_finished_step(self, row: IrValue) -> None:
+        """Store the present states, and the rises of the step that ends there."""
+        self.store_states(row)
+        for (name, _), history in self._histories.items():
+            if history.columns == _WITH_RISES:
+                index = self._lanes.builder.mul(row, self._lanes.make_integer(self._lanes.width))
+                values = self.now[name], self.first_rises[name], self.last_rises[name]
+                self._store_row(history, index, values)
+
+    def _store_row(
+        self, history: StateHistory, index: IrValue, values: tuple[IrValue, ...]
+    ) -> None:
+        """Store the first columns of a row, whose index counts rows of one column."""
+        b, lanes = self._lanes.builder, self._lanes
+        if history.columns > 1:
+            index = b.mul(index, lanes.make_integer(history.columns))
+        for column, value in enumerate(values):
+            place = b.add(index, lanes.make_integer(column * lanes.width)) if column else index
+            lanes.store_row(value, history.base, place)
 
     def load_far_sample(self, name: str, back: int, row: IrValue) -> IrValue:
         """Load the sample a fixed number of steps before the last finished one."""
@@ -285,7 +312,7 @@ class States:
         following = b.add(row, lanes.make_integer(1))
         if not self._histories:
             return following
-        self.store_states(following)
+        self._store_finished_step(following)
 
         def emit_slide() -> list[IrValue]:
             first = b.sub(following, self._reach)

@@ -126,3 +126,70 @@ class CubicReader:
         tangent = lanes.mul(lanes.make_number(halves / 2), self._states.first_rises[self._name])
         bent = lanes.interpolate(tangent, part, lanes.sub(stage, now))
         return lanes.add(now, lanes.mul(part, bent))
+
+
+class StepCubicReader:
+    """Reader of a state at any place, on cubics of the steps, for steps that are divided.
+
+    A row of its history has the state, and the rises of the step that ends there by its first and
+    its last slope.
+    """
+
+    def __init__(
+        self, lanes: VectorBuilder, states: States, past: tuple[str, Expression], delay: IrValue
+    ) -> None:
+        self._lanes, self._states, self._name, self._delay = lanes, states, past[0], delay
+        self._history = states.get_history(past[0])
+
+    def open_loop(self, loop: KernelLoop) -> None:
+        """Create the values that are carried from step to step."""
+
+    def begin_step(self, time_step: TimeStep) -> None:
+        """Read the values that the step needs."""
+        self._time_step = time_step
+
+    def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
+        """Value at `halves` half steps."""
+        place = self._lanes.splat(self._lanes.make_number(halves / 2))
+        return self.read_part(place, now, stage) if halves else self._read_finished(place)
+
+    def read_part(self, part: IrValue, now: IrValue, stage: IrValue) -> IrValue:
+        """Value at any `part` of a step; inside it on the parabola as in `CubicReader`."""
+        lanes = self._lanes
+        share = lanes.div(lanes.sub(part, self._delay), part)
+        tangent = lanes.mul(part, self._states.first_rises[self._name])
+        bent = lanes.interpolate(tangent, share, lanes.sub(stage, now))
+        inside = lanes.add(now, lanes.mul(share, bent))
+        is_inside = lanes.compare("<", self._delay, part)
+        return lanes.select(is_inside, inside, self._read_finished(part))
+
+    def end_step(self, loop: KernelLoop, following: IrValue) -> None:
+        """Update the carried values."""
+
+    def _read_finished(self, part: IrValue) -> IrValue:
+        """Read on the cubic of a finished step: x + f (r + (1 - f) ((1 - f) (a - r) - f (b - r))).
+
+        There f is the place in that step, r its rise, and a and b the rises by both slopes.
+        """
+        lanes = self._lanes
+        whole, fraction = lanes.split_fraction(lanes.sub(part, self._delay))
+        older, newer, first, last = (
+            self._load(whole, steps, column) for steps, column in ((0, 0), (1, 0), (1, 1), (1, 2))
+        )
+        rise, rest = lanes.sub(newer, older), lanes.sub(lanes.make_number(1.0), fraction)
+        bend = lanes.sub(
+            lanes.mul(rest, lanes.sub(first, rise)), lanes.mul(fraction, lanes.sub(last, rise))
+        )
+        return lanes.add(older, lanes.mul(fraction, lanes.add(rise, lanes.mul(rest, bend))))
+
+    def _load(self, whole: IrValue, steps: int, column: int) -> IrValue:
+        """Load a column of the row `whole` + `steps` after the last finished one, or of that."""
+        lanes, b = self._lanes, self._lanes.builder
+        zero = lanes.splat(lanes.make_integer(0))
+        place = b.add(whole, lanes.splat(lanes.make_integer(steps)))
+        place = b.select(b.icmp_signed("<", place, zero), place, zero)
+        size = lanes.make_integer(lanes.width * self._history.columns)
+        index = b.add(lanes.make_lane_numbers(), b.mul(place, lanes.splat(size)))
+        addresses = lanes.compute_addresses(self._history.base, index)
+        shift = b.add(b.mul(self._time_step.row, size), lanes.make_integer(column * lanes.width))
+        return lanes.gather(addresses, shift)

@@ -46,6 +46,16 @@ class DelayedReader(Protocol):
         """Update the carried values; `following` is the state's next value."""
 
 
+def interpolate_points(
+    lanes: VectorBuilder, floats: IrValue, start: IrValue, place: IrValue
+) -> IrValue:
+    """Interpolate an input at places in fine points after the index `start`, one for each lane."""
+    whole, fraction = lanes.split_fraction(lanes.splat(place))
+    addresses = lanes.compute_addresses(floats, lanes.builder.add(whole, lanes.splat(start)))
+    first, second = (lanes.gather(addresses, lanes.make_integer(shift)) for shift in (0, 1))
+    return lanes.interpolate(first, fraction, second)
+
+
 def interpolate_inside_step(
     lanes: VectorBuilder, delay: IrValue, halves: int, now: IrValue, stage: IrValue
 ) -> IrValue:
@@ -158,9 +168,10 @@ class LinearReader:
 class DirectReader:
     """Interpolation of a state that is read again in every step.
 
-    It serves one-step prediction, which changes samples after they were read, and cubic
-    interpolation where there are no slopes. Cubic then means Lagrange through four samples. Where
-    later samples do not exist yet, it uses three samples, or a line inside the present step.
+    It serves one-step prediction, which changes samples after they were read, steps that are
+    divided at switches in time, and cubic interpolation where there are no slopes. Cubic then means
+    Lagrange through four samples. Where later samples do not exist yet, it uses three samples, or a
+    line inside the present step.
     """
 
     def __init__(
@@ -180,7 +191,12 @@ class DirectReader:
     def begin_step(self, time_step: TimeStep) -> None:
         """Read the values that the step needs."""
         self._time_step = time_step
-        self._finished = {halves: self._interpolate(halves) for halves in self._positions}
+        self._finished = {
+            halves: self._interpolate(
+                self._lanes.sub(self._lanes.make_number(halves / 2), self._delay)
+            )
+            for halves in self._positions
+        }
 
     def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
         """Value at `halves` half steps."""
@@ -193,9 +209,16 @@ class DirectReader:
     def end_step(self, loop: KernelLoop, following: IrValue) -> None:
         """Update the carried values."""
 
-    def _interpolate(self, halves: int) -> IrValue:
+    def read_part(self, part: IrValue, now: IrValue, stage: IrValue) -> IrValue:
+        """Value at any `part` of a step; the state is `now` at its start and `stage` there."""
         lanes = self._lanes
-        position = lanes.sub(lanes.make_number(halves / 2), self._delay)
+        finished = self._interpolate(lanes.sub(part, self._delay))
+        portion = lanes.div(lanes.sub(part, self._delay), part)
+        inside = lanes.interpolate(now, portion, stage)
+        return lanes.select(lanes.compare("<", self._delay, part), inside, finished)
+
+    def _interpolate(self, position: IrValue) -> IrValue:
+        lanes = self._lanes
         whole, fraction = lanes.split_fraction(position)
         if not self._cubic:
             return lanes.interpolate(

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from sysid.core.memo import cache_by_identity
 from sysid.language.delays import collect_past_values, has_varying_delay, mentions_time
+from sysid.language.time_switches import list_sides
 from sysid.language.tree import Expression, PastValue
 from sysid.models.model import Model
 
@@ -34,6 +35,12 @@ def list_stages(model: Model) -> tuple[int, ...]:
     if is_difference(model):
         return (2,)
     return (0, 1, 2) if model.solver.method == "rk4" else (0,)
+
+
+@cache_by_identity
+def list_switch_sides(model: Model) -> tuple[Expression, ...]:
+    """List the sides of the switches in time at which an integration step is divided."""
+    return () if is_difference(model) else list_sides(model.equations)
 
 
 def find_state_position(model: Model, stage: int, equation: int, state: int) -> int:
@@ -104,7 +111,7 @@ class StoredHistory(NamedTuple):
     ----------
     state : str
     delay : Expression or None
-        None: the samples.
+        None: the samples; with three columns, also the rises of the steps that end there.
     columns : int
         Values in a row for each individual.
     """
@@ -119,6 +126,8 @@ def list_stored_histories(model: Model) -> list[StoredHistory]:
     if not reads_cubics(model):
         return [StoredHistory(name, None, 1) for name in _list_states_with_history(model)]
     positions = group_delayed_reads(model, "state")
+    if list_switch_sides(model):  # a divided step reads at any place
+        return [StoredHistory(name, None, 3) for name in _list_states_with_history(model)]
     return [StoredHistory(*past, 2 if max(positions[past]) > 0 else 1) for past in positions]
 
 

@@ -3,13 +3,14 @@
 from sysid.kernels.expression_code import Environment
 from sysid.kernels.signals import past_reads
 from sysid.kernels.signals.block_signals import Delays, ExperimentHead, States
-from sysid.kernels.signals.cubic_reads import CubicReader
+from sysid.kernels.signals.cubic_reads import CubicReader, StepCubicReader
 from sysid.kernels.signals.delayed_reads import (
     DelayedReader,
     DirectReader,
     InputReader,
     LinearReader,
     TimeStep,
+    interpolate_points,
 )
 from sysid.kernels.vectors import DOUBLE, IrValue, KernelLoop, VectorBuilder
 from sysid.language.tree import Expression, PastValue
@@ -29,26 +30,31 @@ class SignalReaders:
         one_step: bool,
     ) -> None:
         self._lanes, self._model, self._experiment = lanes, model, experiment
-        self._delays = delays
+        self._delays, self._states = delays, states
         self._inputs = {signal.name: i for i, signal in enumerate(model.inputs)}
         self._readers: dict[tuple[str, Expression, int], DelayedReader] = {}
         self._owners: list[tuple[str, DelayedReader]] = []
+        self._part_readers: dict[tuple[str, Expression], DirectReader | StepCubicReader] = {}
         cubic = model.solver.interpolation == "cubic"
         for past, positions in past_reads.group_delayed_reads(model, "state").items():
             delay = lanes.clamp(delays.to_steps(past[1]), experiment.get_number("cap"))
             if past_reads.reads_cubics(model):
-                self._add_reader(past, positions, CubicReader(lanes, states, past, delay))
+                self._add_cubic_reader(past, positions, delay)
                 continue
             history = states.get_history(past[0])
+            if past_reads.list_switch_sides(model):
+                reader = DirectReader(lanes, history, delay, set(), cubic)
+                self._part_readers[past] = reader
+                self._owners.append((past[0], reader))
             if one_step or cubic:
                 self._add_reader(
                     past, positions, DirectReader(lanes, history, delay, positions, cubic)
                 )
                 continue
             for chain in _group_state_positions(positions):
-                reader = LinearReader(lanes, history, delay, chain, experiment.get_head("reach"))
+                linear = LinearReader(lanes, history, delay, chain, experiment.get_head("reach"))
                 served = positions if chain[0] > 0 else set()
-                self._add_reader(past, {*chain, *(p for p in served if p > 0)}, reader)
+                self._add_reader(past, {*chain, *(p for p in served if p > 0)}, linear)
         for past, positions in past_reads.group_delayed_reads(model, "input").items():
             for chain in past_reads.group_positions(positions):
                 self._add_reader(
@@ -56,6 +62,17 @@ class SignalReaders:
                     {*chain},
                     self._build_input_reader(past[0], delays.to_steps(past[1]), chain),
                 )
+
+    def _add_cubic_reader(
+        self, past: tuple[str, Expression], positions: set[int], delay: IrValue
+    ) -> None:
+        if not past_reads.list_switch_sides(self._model):
+            reader = CubicReader(self._lanes, self._states, past, delay)
+            self._add_reader(past, positions, reader)
+            return
+        anywhere = StepCubicReader(self._lanes, self._states, past, delay)
+        self._part_readers[past] = anywhere
+        self._add_reader(past, positions, anywhere)
 
     def _add_reader(
         self, past: tuple[str, Expression], positions: set[int], reader: DelayedReader
@@ -100,6 +117,33 @@ class SignalReaders:
         steps = self._delays.to_present_steps(past.delay, scope)
         reader = self._build_input_reader(past.name, steps, [halves])
         return reader.load_once(time_step.index)
+
+    def read_input_part(
+        self, past: PastValue, part: IrValue, time_step: TimeStep, scope: Environment
+    ) -> IrValue:
+        """Read an input at any `part` of a step, for each lane."""
+        b, lanes, experiment = self._lanes.builder, self._lanes, self._experiment
+        number = self._inputs[past.name]
+        points, begin, end, cap = (
+            experiment.get_input_field(number, field) for field in ("points", "begin", "end", "cap")
+        )
+        start = b.add(self._find_input_start(number), b.mul(time_step.index, points))
+        if past.delay is None:
+            width = b.sitofp(b.sub(end, begin), DOUBLE)
+            place = lanes.add(b.sitofp(begin, DOUBLE), lanes.mul(part, width))
+        else:
+            count = b.sitofp(points, DOUBLE)
+            fine = lanes.mul(self._delays.to_present_steps(past.delay, scope), count)
+            place = lanes.sub(lanes.mul(part, count), lanes.clamp(fine, b.sitofp(cap, DOUBLE)))
+        return interpolate_points(lanes, experiment.floats, start, place)
+
+    def read_state_part(
+        self, past: PastValue, part: IrValue, now: IrValue, stage: IrValue
+    ) -> IrValue:
+        """Read a delayed state at any `part` of a step, for each lane."""
+        if past.delay is None:
+            raise AssertionError(f"{past.name} is read without delay")
+        return self._part_readers[past.name, past.delay].read_part(part, now, stage)
 
     def load_input(self, name: str, halves: int, step: IrValue) -> IrValue:
         """Load an input without delay: the same for all individuals."""

@@ -187,7 +187,7 @@ def test_the_list_tells_the_verdict_fit_and_warnings_of_each_result(
     (single,) = (row for row in rows if row.startswith(f'"{filled_folder.finished}"'))
     assert '<span class="trust trustworthy">trustworthy</span>' in single
     assert "99.71 %" in single
-    assert '<td class="n" data-label="warnings">1</td>' in single  # its warning
+    assert '<td class="n" data-label="findings">1</td>' in single
     (running,) = (row for row in rows if row.startswith(f'"{filled_folder.running}"'))
     assert 'class="trust' not in running
 

@@ -173,7 +173,7 @@ def test_a_unit_in_a_heading_is_no_markup(capsys: pytest.CaptureFixture[str]) ->
         "predictions": [],
         "notes": [],
     }
-    place = {"x": 5.0, "runs": [], "evaluations": 1, "spans": [], "warnings": []}
+    place = {"x": 5.0, "runs": [], "evaluations": 1, "spans": [], "flags": [], "warnings": []}
     print_trend(
         {
             "x": "length_m",

@@ -280,6 +280,24 @@ outputs: {ramp: x(t - L) + w(t - 3*L), between: "u(t - L)", dt: x, y: w}
 history: {x: K*exp(t/T) - 0.2, w: "where(t < -0.1, T, 3*sin(9*t)) + 0.3"}
 initial: {w: {lower: -1, upper: 1}}
 """
+# Switches in time: jumps, bends, several in a step, in a period, and beside lags and inputs.
+SWITCHES = """
+name: most
+form: differential
+inputs: {u: "1"}
+states: {x: "1", begin: "1"}
+parameters: {K: {lower: 0, upper: 5}, T: {lower: 0.1, upper: 5}, L: {lower: 0, upper: 1, unit: s}}
+equations:
+  x: >-
+    where(t > T and not t >= T + L, K*sqrt(t - T), 0) + u + u(t - L) - x - 0.5*begin(t - 2*L)
+    + max(t - 3*T, 0, x)*sign(2.113 - t)
+  begin: x(t - L) - begin + where(mod(t - L, K) < T, 2, floor(t/T)) + clip(t, T, K)
+outputs: {x: x, y: begin + x(t - L)}
+history: {x: "where(t < -L, T, 3*sin(9*t)) + 0.3"}
+initial: {begin: 0.1}
+"""
+_SWITCHES = ExportCase({"K": 1.5171, "T": 0.7013, "L": 0.0737})
+_SWITCHES_SOON = ExportCase({"K": 1.5171, "T": 0.7013, "L": 0.0237})
 _HISTORY = ExportCase({"K": 0.5, "T": 0.2, "L": 0.0737, "w(0)": 0.4})
 _RESTING = ExportCase({"K": 1.5, "T": 0.2, "L": 0.0737})
 WRITTEN: dict[str, tuple[Model, ExportCase]] = {
@@ -305,6 +323,14 @@ WRITTEN: dict[str, tuple[Model, ExportCase]] = {
     "history_own_step": (written(HISTORY, step=0.017, history="zero"), _HISTORY),
     "history_euler_cubic": (written(HISTORY, method="euler", interpolation="cubic"), _HISTORY),
     "history_semi_implicit": (written(HISTORY, method="semi-implicit"), _HISTORY),
+    "switches": (written(SWITCHES), _SWITCHES),
+    "switches_linear": (written(SWITCHES, interpolation="linear", substeps=2), _SWITCHES_SOON),
+    "switches_own_step": (written(SWITCHES, step=0.0171, history="zero"), _SWITCHES),
+    "switches_euler_nearest": (
+        written(SWITCHES, method="euler", interpolation="nearest"),
+        _SWITCHES,
+    ),
+    "switches_semi_implicit": (written(SWITCHES, method="semi-implicit"), _SWITCHES_SOON),
     "steady_substeps": (starting(RESTING, "steady", substeps=2), _RESTING),
     "steady_own_step": (starting(RESTING, "steady", step=0.017), _RESTING),
     "steady_off_samples": (starting(RESTING, "steady", step=0.0171), _RESTING),
@@ -338,10 +364,19 @@ GATE: dict[Hold, set[str]] = {
         *("rk4", "rk4_own_step", "euler_nearest", "euler_cubic", "semi_implicit"),
         *("names", "tables", "functions", "selected", "flow"),
         *("history", "history_own_step", "history_semi_implicit"),
+        *("switches", "switches_linear", "switches_own_step"),
+        *("switches_euler_nearest", "switches_semi_implicit"),
         *("recursion", "recursion_cubic", "recursion_nearest", "recursion_of_flow"),
         *("recursion_of_names", "start_of_recursion", "steady", "steady_off_samples"),
     },
-    "first": {"duffing_eq16", "rk4_linear", "flow_substeps", "history_linear", "recursion"},
+    "first": {
+        "duffing_eq16",
+        "rk4_linear",
+        "flow_substeps",
+        "history_linear",
+        "switches",
+        "recursion",
+    },
 }
 EXPORTS = [
     pytest.param(name, hold, marks=[] if name in names else [pytest.mark.night])

@@ -6,13 +6,23 @@ floats. It shares with the kernel how records are laid out, and nothing else.
 
 import math
 from collections.abc import Mapping
+from itertools import combinations
 from math import floor
 
 import numpy as np
 
 from sysid.core.types import FloatArray
 from sysid.data.interpolation import FineInput
-from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
+from sysid.language.tree import (
+    Binary,
+    Expression,
+    FunctionCall,
+    Number,
+    PastValue,
+    Symbol,
+    Unary,
+    walk,
+)
 from sysid.models.model import (
     DerivedInitial,
     EstimatedInitial,
@@ -48,6 +58,19 @@ _FUNCTIONS = {
     "table": lambda at, *points: np.interp(at, *np.reshape(points, (2, -1))),
     "pchip": lambda at, *points: interpolate_pchip(at, *np.reshape(points, (2, -1))),
 }
+_SIDES = {
+    "sign": lambda x: (_tell(x, 0), _tell(0, x)),
+    "abs": lambda x: (_tell(x, 0), _tell(0, x)),
+    "floor": lambda x: (np.floor(x),),
+    "min": lambda *x: tuple(_tell(a, b) for a, b in combinations(x, 2)),
+    "max": lambda *x: tuple(_tell(a, b) for a, b in combinations(x, 2)),
+    "clip": lambda x, *limits: tuple(_tell(x, limit) for limit in limits),
+}
+"""On which sides of their switches the functions that jump or bend are, at their arguments."""
+
+
+def _tell(a: float, b: float) -> float:
+    return np.nan if np.isnan(a + b) else float(a > b)
 
 
 _OPERATORS = {
@@ -167,22 +190,77 @@ class ModelTwin:
         return values
 
     def _integrate(self, m: int) -> dict[str, float]:
-        h, now, method = self.step, self._now(), self.model.solver.method
+        """One step, in parts between the times at which an equation switches."""
+        values, begin, switches = self._now(), 0.0, self._count_switches()
+        for number in range(switches + 1):
+            end, following = self._find_switch(m, begin) if number < switches else (1.0, 1.0)
+            values = self._integrate_part(m, begin, end, values)
+            if following >= 1.0:
+                break
+            begin = following
+        return values
+
+    def _integrate_part(
+        self, m: int, begin: float, end: float, now: dict[str, float]
+    ) -> dict[str, float]:
+        h, middle, method = self.step * (end - begin), (begin + end) / 2, self.model.solver.method
         if method == "rk4":
-            a = self.present = self._slopes(m, 0.0, now)
-            b = self._slopes(m, 0.5, self._move(now, h / 2, a))
-            c = self._slopes(m, 0.5, self._move(now, h / 2, b))
-            d = self._slopes(m, 1.0, self._move(now, h, c))
-            self.slopes.append((a, d))
+            a = self._slopes(m, begin, now)
+            if begin == 0.0:
+                self.present = a
+            b = self._slopes(m, middle, self._move(now, h / 2, a))
+            c = self._slopes(m, middle, self._move(now, h / 2, b))
+            d = self._slopes(m, end, self._move(now, h, c))
+            self.slopes = [*self.slopes[:m], (self.present, d)]
             return {n: now[n] + h / 6 * (a[n] + 2 * b[n] + 2 * c[n] + d[n]) for n in now}
         values = dict(now)
         updated = {}
+        self.end = end
         for i, equation in enumerate(self.model.equations):
             name = self.names[i]
-            updated[name] = now[name] + h * self._value(equation, m, 0.0, values, i)
+            updated[name] = now[name] + h * self._value(equation, m, begin, values, i)
             if method == "semi-implicit":
                 values[name] = updated[name]
         return updated
+
+    # ---- switches in time -----------------------------------------------------------------
+    def _count_switches(self) -> int:
+        return len(self._tell_sides(0, 0.0))
+
+    def _find_switch(self, m: int, begin: float) -> tuple[float, float]:
+        """Just before and just behind the next switch in a step."""
+        before = self._tell_sides(m, begin)
+        if self._tell_sides(m, 1.0) == before:
+            return 1.0, 1.0
+        low, high = begin, 1.0
+        for _ in range(52):
+            middle = (low + high) / 2
+            if self._tell_sides(m, middle) == before:
+                low = middle
+            else:
+                high = middle
+        return low, high
+
+    def _tell_sides(self, m: int, c: float) -> list[float]:
+        """On which side of each of its switches in time the equations are."""
+        told: list[float] = []
+        for node in dict.fromkeys(n for e in self.model.equations for n in walk(e)):
+            arguments = node.arguments if isinstance(node, FunctionCall) else ()
+            ends = [self._value_in_time(argument, m, c) for argument in arguments]
+            match node:
+                case Binary("<" | "<=" | ">" | ">="):
+                    told.append(self._value_in_time(node, m, c))
+                case FunctionCall("mod"):
+                    told.append(np.round((ends[0] - np.mod(ends[0], ends[1])) / ends[1]))
+                case FunctionCall(function) if function in _SIDES:
+                    told += _SIDES[function](*ends)
+        return [float(side) for side in told if not np.isnan(side)]
+
+    def _value_in_time(self, e: Expression, m: int, c: float) -> float:
+        """An expression without signals; nan of any other."""
+        if any(isinstance(part, PastValue) for part in walk(e)):
+            return math.nan
+        return float(self._value(e, m, c, {}, 0))
 
     def _slopes(self, m: int, c: float, values: dict[str, float]) -> dict[str, float]:
         return {
@@ -242,7 +320,7 @@ class ModelTwin:
             return values[past.name]
         semi = not self.difference and self.model.solver.method == "semi-implicit"
         if semi and self.names.index(past.name) < equation:
-            c = 1.0  # already updated: as it is at the end of the step
+            c = self.end  # already updated: as it is at the end of the part
         place = c - past.offset
         at = place - self._lag(past, m, c)
         if m + at < 0 and past.name in self.histories:
@@ -294,13 +372,17 @@ class ModelTwin:
         start = fine.begin if self.difference else 0
         place = m + c - past.offset
         if past.delay is None and not self.difference:
-            return float(
-                fine.values[fine.start_index + m * fine.points_per_step + _inside(fine, c)]
-            )
-        at = fine.start_index + start + (place - self._lag(past, m, c)) * fine.points_per_step
-        i = floor(at)
-        return float(fine.values[i] + (at - i) * (fine.values[i + 1] - fine.values[i]))
+            return self._between_points(fine, m * fine.points_per_step + _inside(fine, c))
+        return self._between_points(
+            fine, start + (place - self._lag(past, m, c)) * fine.points_per_step
+        )
+
+    @staticmethod
+    def _between_points(fine: FineInput, place: float) -> float:
+        i = fine.start_index + floor(place)
+        part = place - floor(place)
+        return float(fine.values[i] + part * (fine.values[i + 1] - fine.values[i]))
 
 
-def _inside(fine: FineInput, c: float) -> int:
-    return {0.0: fine.begin, 0.5: fine.points_per_step // 2, 1.0: fine.end}[c]
+def _inside(fine: FineInput, c: float) -> float:
+    return fine.begin + c * (fine.end - fine.begin)

@@ -28,7 +28,9 @@ from service.repositories.history_rows import HistoryPoint, MigrantPoint
 from service.repositories.run_rows import RunRepository
 from service.storage.objects import ObjectStore, open_store
 from service.storage.sessions import Database
+from sysid.core.value_documents import encode
 from sysid.data.records import Channel, Recording
+from sysid.results.findings import note
 from tests.support.service.web_app import settings_of
 from tests.support.storage.databases import open_migrated_sqlite
 from tests.support.storage.run_results import write_result
@@ -51,6 +53,11 @@ MODEL = {
 TRUE = {"K": 1.0153, "T": 0.3489, "L": 0.1127}
 SIGMA = 0.42
 STEP = 0.01
+NOTE = note(
+    "ridge",
+    "identifiability",
+    "T and L have the correlation −0.78: T + L is better known than either",
+)
 
 
 @dataclass(frozen=True)
@@ -305,8 +312,10 @@ def _result(rms: float = SIGMA) -> dict[str, Any]:
                 "reason": "",
             }
         ],
-        "verdict": {"trust": "trustworthy", "text": "trustworthy", "reasons": []},
-        "warnings": ["T and L have the correlation −0.78: T + L is better known than either"],
+        "findings": [encode(NOTE)],
+        "explained": True,
+        "verdict": {"trust": "trustworthy", "text": "trustworthy"},
+        "warnings": [NOTE.text],
     }
     return write_result(**parts)
 

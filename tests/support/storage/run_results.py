@@ -62,6 +62,8 @@ def conclude(
             posterior=None,
             order_comparison=None,
             delays=(),
+            findings=(),
+            explained=True,
             verdict=Verdict("trustworthy", "trustworthy"),
             warnings=(),
             substeps=1,

@@ -2,13 +2,9 @@
 
 from dataclasses import replace
 
-from service.core.states import JobState
-from service.jobs.stored_run import StoredRun
-from service.pages.views import format_cell, to_run_view
-from service.storage.tables import Job, Run
-from sysid.core.value_documents import encode
-from sysid.models.catalogue.load import load_model
-from sysid.results.result import Result
+from service.pages.result_filters import list_note_texts
+from service.pages.views import format_cell
+from sysid.results.findings import note
 from tests.support.checkout import ROOT
 from tests.support.storage.run_results import conclude
 
@@ -24,19 +20,9 @@ def test_where_labels_tell_of_the_data_their_identifiers_are_left_out() -> None:
 
 
 def test_a_note_names_the_fields_of_the_form() -> None:
-    note = "Read as straight lines (hold: {u: first}) or with loss: {noise_model: ar1} it differs"
-    run = Run(
-        id="run_1",
-        number=0,
-        state=JobState.FAILED,
-        cell={},
-        labels={},
-        evaluations=0,
-        generations=0,
-        result=encode(replace(conclude().identification, warnings=(note,)), Result),
-    )
-    job = Job(spec={"model": "fopdt"})
-    [shown] = to_run_view(StoredRun(job, run, {}, load_model("fopdt")), "", {}).warnings
+    text = "Read as straight lines (hold: {u: first}) or with loss: {noise_model: ar1} it differs"
+    found = replace(conclude().identification, findings=(note("reading", "reading", text),))
+    [shown] = list_note_texts(found)
     assert shown == (
         "Read as straight lines (“u between samples: straight line (first)”) or with "
         "“noise: first-order coloured (ar1)” it differs"

@@ -21,6 +21,7 @@ def make_row(run: str, x: float, cell: dict[str, Any] | None = None, **values: A
         "parameters": (),
         "onset_delays": (),
         "agreement": Agreements((), ()),
+        "findings": (),
         "warnings": (),
         "noise_model": "white",
     }

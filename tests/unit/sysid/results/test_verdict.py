@@ -178,7 +178,7 @@ def make_orders(*bics: float) -> OrderComparison:
         OrderFit(name, place, delay, 0.01, {"L": delay}, 0.02, bic)
         for place, (name, delay, bic) in enumerate(zip(names, delays, bics, strict=False), 1)
     )
-    return compare_fits("fopdt", "L", "s", "white", tuple(fits))
+    return compare_fits("fopdt", "L", "s", "white", tuple(fits), 300)
 
 
 def test_an_order_that_the_data_prefer_limits_the_trust_and_names_its_lag() -> None:

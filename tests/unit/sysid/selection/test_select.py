@@ -339,9 +339,9 @@ def test_pages_show_the_selected_terms_in_their_order() -> None:
     second = SelectedTerm("u(k-1)", 0.417, 1.0 + 1e-16, 0.5)
     chosen = replace(conclude().identification, selection=(first, second))
     parts = template_environment().get_template("parts.html").module
-    rows = re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', parts.findings(chosen))  # type: ignore[attr-defined]
+    rows = re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', parts.evidence(chosen))  # type: ignore[attr-defined]
     assert [(term, re.findall(r">([^<]+)</td>", cells)) for term, cells in rows] == [
         ("y(k-1)", ["0.5830", "0.4170"]),
         ("u(k-1)", ["0.4170", "0"]),
     ]
-    assert "Selected term" not in parts.findings(conclude().identification)  # type: ignore[attr-defined]
+    assert "Selected term" not in parts.evidence(conclude().identification)  # type: ignore[attr-defined]
