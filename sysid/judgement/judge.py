@@ -80,6 +80,7 @@ def explain_residuals(context: ResidualContext) -> Explained:
     if not _is_possible(context):
         return Explained()
     base = context.residual_model.without
+    before: ColumnFit | None = None
     taken, counted = np.zeros((context.times.size, 0)), 0
     candidates = list(_list_candidates(context, _PROPOSERS))
     scored = _score(context, candidates, taken, counted, base.criterion)
@@ -98,12 +99,12 @@ def explain_residuals(context: ResidualContext) -> Explained:
             if best.gain - one.gain < STRONG_ODDS
             and one.candidate.explanation != best.candidate.explanation
         ]
-        findings.append(_describe(context, best, base, rivals))
+        findings.append(_describe(context, best, before, rivals))
         if best.moves is not None:
             break  # the estimate is another one then
         taken = np.hstack([taken, best.candidate.columns])
         counted += best.candidate.counted
-        base = best.fit
+        base = before = best.fit
         candidates = [one.candidate for one in scored if one.gain > DEFECT_GAIN][1:]
         scored = _score(context, candidates, taken, counted, base.criterion)
     findings += find_noise(context, base)
@@ -217,13 +218,16 @@ def _part_finalist(
 
 
 def _describe(
-    context: ResidualContext, best: _Scored, base: ColumnFit, rivals: Sequence[_Scored]
+    context: ResidualContext,
+    best: _Scored,
+    before: ColumnFit | None,
+    rivals: Sequence[_Scored],
 ) -> Finding:
     candidate = best.candidate
-    moves = best.moves or context.compute_moves(best.fit, base, candidate.varies)
+    moves = best.moves or context.compute_moves(best.fit, before, candidate.varies)
     notable = _list_notable(moves)
     for rival in rivals:
-        notable |= _list_notable(context.compute_moves(rival.fit, base, rival.candidate.varies))
+        notable |= _list_notable(context.compute_moves(rival.fit, before, rival.candidate.varies))
     if candidate.is_vague or _is_large(context, best):
         notable = {move.parameter for move in moves}
     text = f"{candidate.text}."

@@ -236,7 +236,9 @@ def _keep_edges(values: FloatArray, width: int) -> FloatArray:
     Little is a few deviations of the differences between neighbours.
     """
     deviation = 1.4826 * float(np.median(np.abs(np.diff(values)))) / np.sqrt(2.0)
+    if not deviation > 0:  # levels that are held have no noise
+        return values
     padded = np.pad(values, width // 2, mode="edge")
     windows = sliding_window_view(padded, width)
-    weights = np.exp(-0.5 * ((windows - values[:, None]) / max(3.0 * deviation, 1e-300)) ** 2)
+    weights = np.exp(-0.5 * ((windows - values[:, None]) / (3.0 * deviation)) ** 2)
     return np.asarray(np.sum(weights * windows, axis=1) / np.sum(weights, axis=1))
