@@ -19,7 +19,7 @@ move at the limit is an error of the solver, and is added to the standard error.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import ceil, hypot, inf, log10, sqrt
+from math import ceil, inf, log10, sqrt
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import to_unit
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale
 from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.intervals import IntegrationError, compose_interval
 from sysid.uncertainty.sensitivities import BudgetSpentError, compute_sensitivities
 
 _FACTOR = 2
@@ -195,16 +196,7 @@ def _mark_estimate(estimate: Estimate, half: HalfStep, limit: str) -> Estimate:
     if move is None or estimate.stderr is None or estimate.interval95 is None:
         reason = f"half the integration step still changes it: {half.changes[estimate.name]}"
         return replace(estimate, status="unidentifiable", reason=f"{reason}; {limit}")
-    stderr = hypot(estimate.stderr, move)
-    factor = stderr / estimate.stderr
-    lower, upper = (estimate.value + factor * (end - estimate.value) for end in estimate.interval95)
-    return replace(
-        estimate,
-        stderr=stderr,
-        interval95=(lower, upper),
-        reason=f"its error is that of the integration: half the step moves it by {move:.1g}"
-        f"{format_unit(estimate.unit)}, and the record has no noise",
-    )
+    return compose_interval(estimate, IntegrationError(move))
 
 
 def explain_finer_step(

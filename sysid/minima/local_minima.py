@@ -23,7 +23,7 @@ and the position on a plateau where a search ends has no meaning.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -32,7 +32,11 @@ from sysid.models.parameters import Parameter
 from sysid.search.refine import RefinedCandidate, refine_candidate
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
-from sysid.uncertainty.intervals import mark_poor_intervals
+from sysid.uncertainty.intervals import (
+    CompatibleMinima,
+    compose_interval,
+    mark_poor_intervals,
+)
 from sysid.uncertainty.linear_model import LinearOutputModel, factor_covariance, make_move_generator
 
 _DRAW_DEVIATIONS = np.array([0.5, 1.0, 2.0, 3.0])  # standard errors
@@ -215,22 +219,9 @@ def widen_intervals(
         one.name: d for d, one in enumerate(parameters) if np.isfinite(variance_ratio[d])
     }
     widened = [
-        _widen_interval(one, minima.values[:, d], ratio * variance_ratio[d])
+        compose_interval(one, CompatibleMinima(minima.values[:, d], ratio * variance_ratio[d]))
         if (d := index_by_name.get(one.name)) is not None
         else one
         for one in estimates
     ]
     return mark_poor_intervals(parameters, widened)
-
-
-def _widen_interval(estimate: Estimate, values: FloatArray, ratios: FloatArray) -> Estimate:
-    """Widen an interval by the values (m,) of minima with their likelihood ratios (m,)."""
-    if not estimate.stderr or estimate.interval95 is None:
-        return estimate
-    lower, upper = estimate.interval95
-    quantile = (upper - lower) / (2.0 * estimate.stderr)
-    is_compatible = ratios <= quantile**2
-    half = estimate.stderr * np.sqrt(quantile**2 - ratios[is_compatible])
-    middle = values[is_compatible]
-    low, high = float((middle - half).min()), float((middle + half).max())
-    return replace(estimate, interval95=(min(lower, low), max(upper, high)))

@@ -54,7 +54,7 @@ from sysid.uncertainty.estimates import (
     NoiseColour,
     Uncertainty,
 )
-from sysid.uncertainty.intervals import LocalStatistics, make_estimates
+from sysid.uncertainty.intervals import Plateau, compose_interval
 from sysid.uncertainty.likelihood import LikelihoodModel
 from sysid.uncertainty.linear_model import LinearOutputModel, linearise_outputs
 from sysid.uncertainty.local_algebra import (
@@ -64,6 +64,7 @@ from sysid.uncertainty.local_algebra import (
     invert_squared,
     scale_matrix,
 )
+from sysid.uncertainty.local_estimates import LocalStatistics, make_estimates
 from sysid.uncertainty.sensitivities import BudgetSpentError, Sensitivities, compute_sensitivities
 
 
@@ -328,7 +329,7 @@ def _correct_for_jumps(
         _remove_stderr(estimate) if estimate.name in blind else estimate for estimate in estimates
     )
     return tuple(
-        _centre_on_plateau(estimate, offsets[estimate.name])
+        compose_interval(estimate, Plateau(offsets[estimate.name]))
         if estimate.name in offsets
         else estimate
         for estimate in corrected
@@ -339,17 +340,6 @@ def _remove_stderr(estimate: Estimate) -> Estimate:
     """Remove the standard error if the output jumps on one side of the estimate only."""
     reason = "the output changes with it in jumps, and here on one side only"
     return replace(estimate, stderr=None, interval95=None, reason=reason)
-
-
-def _centre_on_plateau(estimate: Estimate, plateau_offset: float) -> Estimate:
-    """Centre the interval of an estimate on its plateau, whose middle is `plateau_offset` above it.
-
-    The loss is constant on a plateau, so the position where the search ended has no meaning.
-    """
-    if estimate.interval95 is None:
-        return estimate
-    lower, upper = estimate.interval95
-    return replace(estimate, interval95=(lower + plateau_offset, upper + plateau_offset))
 
 
 def _compute_possible_gain(
