@@ -37,7 +37,7 @@ from sysid.minima.local_minima import (
     LocalMinima,
     count_affordable_simulations,
     find_local_minima,
-    widen_intervals,
+    list_compatible_minima,
 )
 from sysid.minima.minima import (
     Fit,
@@ -70,7 +70,12 @@ from sysid.search.state import SAME_OPTIMUM
 from sysid.simulation.problem import Problem, compute_metrics
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
-from sysid.uncertainty.intervals import keep_in_bounds, mark_poor_intervals
+from sysid.uncertainty.intervals import (
+    compose_intervals,
+    keep_in_bounds,
+    mark_poor_intervals,
+)
+from sysid.uncertainty.profile_ends import find_profile_ends
 from sysid.uncertainty.unequal_noise import fit_unequal_noise
 
 _MOST_PROJECTED = 6000  # simulations of a scan by projection
@@ -147,6 +152,8 @@ def find_best_estimate(
     budget: Budget,
     deadline: Deadline,
     validation: Problem | None = None,
+    *,
+    profiles: bool = False,
 ) -> BestEstimate:
     """Find the best estimate of a search that has ended, and analyse it.
 
@@ -154,7 +161,8 @@ def find_best_estimate(
 
     The integration step is halved until the estimates and their errors stand still, or until a
     limit is reached. Then those that still change are not identified, or have the change in their
-    errors.
+    errors. With `profiles`, intervals follow the profile likelihood where the linear model does not
+    hold.
     """
     refines = is_refining(algorithm, len(state.islands))
     search = _EstimateSearch(problem, state, budget, deadline, refines=refines)
@@ -174,8 +182,11 @@ def find_best_estimate(
     recorded = search.compare_where_recorded()  # a noise model would hide a contradiction
     noise = search.apply_noise_model(validation, is_settled=not changes)
     minima = search.collect_minima(recorded)
-    marked = mark_changing(search.analysis.estimates, half, limit)
-    marked = mark_poor_intervals(search.problem.free_parameters, marked)
+    if profiles and refines:
+        search.follow_profiles(noise.theta)
+    parameters = search.problem.free_parameters
+    marked = mark_poor_intervals(parameters, search.analysis.estimates)
+    marked = mark_poor_intervals(parameters, mark_changing(marked, half, limit))
     analysis = replace(search.analysis, estimates=keep_in_bounds(marked))
     return BestEstimate(search.problem, tuple(search.ends), minima, first, noise, analysis)
 
@@ -413,6 +424,21 @@ class _EstimateSearch:
         all_minima = (*minima, *recorded.minima)
         return FoundMinima(all_minima, agreeing, self._projected, recorded.is_contradicted)
 
+    def follow_profiles(self, theta: FloatArray) -> None:
+        """Replace the intervals around an estimate (D,) that those of a linear model miss."""
+        if self._deadline.is_past_grace():
+            return
+        most = count_affordable_simulations(self.problem, self._deadline.is_over())
+        found = find_profile_ends(self.problem, theta, self.analysis, self._budget.cap(most))
+        self._budget.spend(found.evaluations)
+        beyond = {
+            name: self.analysis.minima[name].select_beyond(ends.interval)
+            for name, ends in found.by_name.items()
+            if name in self.analysis.minima
+        }
+        estimates = compose_intervals(self.analysis.estimates, found.by_name, beyond)
+        self.analysis = replace(self.analysis, estimates=estimates)
+
     def _is_late(self) -> bool:
         """Whether no search may begin: the paper's methods have none."""
         return not self._refines or self._deadline.is_past_grace()
@@ -543,18 +569,20 @@ class _EstimateSearch:
 
     def _widen_intervals(self, minima: LocalMinima) -> None:
         """Widen the intervals so that they contain those of all minima."""
-        linear, problem = self.analysis.linear_model, self.problem
-        if linear is None:
+        linear, likelihood = self.analysis.linear_model, self.analysis.likelihood
+        if linear is None or likelihood is None:
             return
+        problem = self.problem
         values = order_exchangeable(problem, minima.values, self.analysis.exchanges)
-        estimates = widen_intervals(
-            self.analysis.estimates,
-            problem.free_parameters,
+        near = list_compatible_minima(
+            problem.free_names,
             problem.n_scored,
             replace(minima, values=values),
             linear.variance_ratio,
+            likelihood.quantiles,
         )
-        self.analysis = replace(self.analysis, estimates=estimates)
+        estimates = compose_intervals(self.analysis.estimates, near)
+        self.analysis = replace(self.analysis, estimates=estimates, minima=near)
 
     def _count_scan_simulations(self) -> int:
         """Count the simulations that a scan may take."""

@@ -83,7 +83,8 @@ def conclude_run(
     the time of the run is limited, refinement ends near the limit and warnings list what was left
     out. Standard errors, tests and validation are always computed. `clock` returns seconds. With
     `posterior` samples of the posterior are taken, as far as budget and time are left. With
-    `orders` a process with dead time is compared with one order more and one less.
+    `orders` a process with dead time is compared with one order more and one less, and intervals
+    follow the profile likelihood where those of the linear model do not hold.
 
     Raises
     ------
@@ -118,7 +119,9 @@ def _build_identification(
     compares_orders: bool,
 ) -> Identification:
     budget = Budget(algorithm.stop.evaluations, state.evaluations)
-    best = find_best_estimate(problem, algorithm, state, budget, deadline, validation)
+    best = find_best_estimate(
+        problem, algorithm, state, budget, deadline, validation, profiles=compares_orders
+    )
     asked, noise, minima, analysis = problem, best.noise, best.minima, best.analysis
     problem, theta = resolve_noise_model(best.problem, noise), noise.theta
     if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():

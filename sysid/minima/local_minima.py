@@ -28,15 +28,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.core.types import FloatArray
-from sysid.models.parameters import Parameter
 from sysid.search.refine import RefinedCandidate, refine_candidate
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.estimates import Estimate
-from sysid.uncertainty.intervals import (
-    CompatibleMinima,
-    compose_interval,
-    mark_poor_intervals,
-)
+from sysid.uncertainty.intervals import CompatibleMinima
 from sysid.uncertainty.linear_model import LinearOutputModel, factor_covariance, make_move_generator
 
 _DRAW_DEVIATIONS = np.array([0.5, 1.0, 2.0, 3.0])  # standard errors
@@ -201,27 +195,24 @@ class _LocalSearch:
         return starts, self._problem.evaluate_fitness(starts)
 
 
-def widen_intervals(
-    estimates: tuple[Estimate, ...],
-    parameters: Sequence[Parameter],
+def list_compatible_minima(
+    names: Sequence[str],
     n: int,
     minima: LocalMinima,
     variance_ratio: FloatArray,
-) -> tuple[Estimate, ...]:
-    """Widen intervals so that they contain those of all minima that the data do not rule out.
+    quantiles: FloatArray,
+) -> dict[str, CompatibleMinima]:
+    """List the minima with their likelihood ratios, for each of the free parameters' `names`.
 
-    `variance_ratio` (D,) is that of `LinearOutputModel`, for the free `parameters`.
+    `variance_ratio` (D,) is that of `LinearOutputModel`. `quantiles` (D,) are those of the t
+    distribution. A parameter without a variance ratio is left out.
     """
     least = minima.rms.min()
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = 2.0 * n * np.log(np.where(minima.rms > least, minima.rms / least, 1.0))
-    index_by_name = {
-        one.name: d for d, one in enumerate(parameters) if np.isfinite(variance_ratio[d])
+    return {
+        names[d]: CompatibleMinima(
+            minima.values[:, d], ratio * variance_ratio[d], float(quantiles[d])
+        )
+        for d in np.flatnonzero(np.isfinite(variance_ratio)).tolist()
     }
-    widened = [
-        compose_interval(one, CompatibleMinima(minima.values[:, d], ratio * variance_ratio[d]))
-        if (d := index_by_name.get(one.name)) is not None
-        else one
-        for one in estimates
-    ]
-    return mark_poor_intervals(parameters, widened)

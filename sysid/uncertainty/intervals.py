@@ -18,7 +18,7 @@
 """
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import hypot, inf, log
 from typing import Protocol
@@ -30,7 +30,7 @@ from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.language.functions import Interval
 from sysid.models.parameters import Parameter
-from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.estimates import Estimate, IntervalEnd
 
 _TAIL = 0.025  # of the distribution, beyond each end of an interval
 _POOR_SHARE = 1 / 3  # of a range: an interval around 0 that covers more says little
@@ -53,6 +53,16 @@ def compose_interval(estimate: Estimate, *sources: IntervalSource) -> Estimate:
     for source in sources:
         estimate = source.apply(estimate)
     return estimate
+
+
+def compose_intervals(
+    estimates: Sequence[Estimate], *sources: Mapping[str, IntervalSource]
+) -> tuple[Estimate, ...]:
+    """Compose the intervals of the estimates that have such sources, by name."""
+    return tuple(
+        compose_interval(one, *(by_name[one.name] for by_name in sources if one.name in by_name))
+        for one in estimates
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,23 +115,30 @@ class CompatibleMinima:
         The parameter's values there, in its unit.
     ratios : FloatArray, shape (m,)
         Likelihood ratios to the best of them, scaled to follow χ² with one degree of freedom.
+    quantile : float
+        Of the t distribution, for 95 %.
     """
 
     values: FloatArray
     ratios: FloatArray
+    quantile: float
+
+    def select_beyond(self, ends: Interval) -> "CompatibleMinima":
+        """Select the minima outside an interval."""
+        is_beyond = (self.values < ends[0]) | (self.values > ends[1])
+        return replace(self, values=self.values[is_beyond], ratios=self.ratios[is_beyond])
 
     def apply(self, estimate: Estimate) -> Estimate:
-        """Widen the interval by those of the minima whose ratio is below its quantile squared.
+        """Widen the interval by those of the minima whose ratio is below the quantile squared.
 
         With the curvature of the best minimum, each one covers √(quantile² - ratio) standard
         errors.
         """
-        if not estimate.stderr or estimate.interval95 is None:
+        is_compatible = self.ratios <= self.quantile**2
+        if not estimate.stderr or estimate.interval95 is None or not is_compatible.any():
             return estimate
         lower, upper = estimate.interval95
-        quantile = (upper - lower) / (2.0 * estimate.stderr)
-        is_compatible = self.ratios <= quantile**2
-        half = estimate.stderr * np.sqrt(quantile**2 - self.ratios[is_compatible])
+        half = estimate.stderr * np.sqrt(self.quantile**2 - self.ratios[is_compatible])
         middle = self.values[is_compatible]
         low, high = float((middle - half).min()), float((middle + half).max())
         return replace(estimate, interval95=(min(lower, low), max(upper, high)))
@@ -151,6 +168,46 @@ class IntegrationError:
             f"{format_unit(estimate.unit)}, and the record has no noise"
         )
         return replace(estimate, stderr=stderr, interval95=(lower, upper), reason=reason)
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileEnds:
+    """Ends by the profile likelihood (`sysid.uncertainty.profile_ends`).
+
+    Attributes
+    ----------
+    interval : tuple of float
+        In the parameter's unit.
+    open_ends : tuple of IntervalEnd
+        Ends at a bound, up to which the data speak for any value.
+    """
+
+    interval: Interval
+    open_ends: tuple[IntervalEnd, ...] = ()
+
+    def apply(self, estimate: Estimate) -> Estimate:
+        """Replace the interval.
+
+        A parameter with an open end is practically not identifiable (Raue et al., Bioinformatics 25
+        (2009) 1923).
+        """
+        found = replace(estimate, interval95=self.interval, open_ends=self.open_ends)
+        if not self.open_ends or estimate.status != "identified":
+            return found
+        return replace(found, status="unidentifiable", reason=describe_open_ends(found))
+
+
+def describe_open_ends(estimate: Estimate) -> str:
+    """Describe up to where an interval with an open end holds any value."""
+    if estimate.interval95 is None or not estimate.open_ends:
+        return ""
+    unit = format_unit(estimate.unit)
+    low, high = (f"{end:.4g}{unit}" for end in estimate.interval95)
+    if len(estimate.open_ends) > 1:
+        return f"open on both sides: all values from {low} to {high} fit"
+    if estimate.open_ends == ("upper",):
+        return f"open above: all values from {low} up to its bound fit"
+    return f"open below: all values from {high} down to its bound fit"
 
 
 @dataclass(frozen=True, slots=True)

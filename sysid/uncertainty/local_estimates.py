@@ -12,7 +12,7 @@ from sysid.language.tree import Expression
 from sysid.models.parameters import Parameter
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
-from sysid.uncertainty.intervals import LocalInterval, compose_interval, mark_poor_intervals
+from sysid.uncertainty.intervals import LocalInterval, compose_interval
 
 _TIE_STEP = 1e-6  # of the range: slopes of ties
 _NULL_SHARE = 1e-4  # share of a tie's slope along directions that have no effect
@@ -58,12 +58,9 @@ def make_estimates(problem: Problem, statistics: LocalStatistics) -> tuple[Estim
     free = {
         p.name: _make_free_estimate(p, statistics, d) for d, p in enumerate(problem.free_parameters)
     }
-    return mark_poor_intervals(
-        problem.free_parameters,
-        tuple(
-            free.get(p.name) or _make_fixed_or_tied_estimate(problem, statistics, p)
-            for p in problem.all_parameters
-        ),
+    return tuple(
+        free.get(p.name) or _make_fixed_or_tied_estimate(problem, statistics, p)
+        for p in problem.all_parameters
     )
 
 
