@@ -19,7 +19,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import hypot, inf, log
 from typing import Protocol
 
@@ -178,12 +178,12 @@ class ProfileEnds:
     ----------
     interval : tuple of float
         In the parameter's unit.
-    open_ends : tuple of IntervalEnd
-        Ends at a bound, up to which the data speak for any value.
+    limits : mapping of IntervalEnd to str
+        For each open end the parameter whose bound stops it: no data do. Mostly it is its own.
     """
 
     interval: Interval
-    open_ends: tuple[IntervalEnd, ...] = ()
+    limits: Mapping[IntervalEnd, str] = field(default_factory=dict)
 
     def apply(self, estimate: Estimate) -> Estimate:
         """Replace the interval.
@@ -191,23 +191,22 @@ class ProfileEnds:
         A parameter with an open end is practically not identifiable (Raue et al., Bioinformatics 25
         (2009) 1923).
         """
-        found = replace(estimate, interval95=self.interval, open_ends=self.open_ends)
-        if not self.open_ends or estimate.status != "identified":
+        found = replace(estimate, interval95=self.interval, open_ends=tuple(self.limits))
+        if not self.limits or estimate.status != "identified":
             return found
-        return replace(found, status="unidentifiable", reason=describe_open_ends(found))
+        return replace(found, status="unidentifiable", reason=self._describe_limits(estimate))
 
-
-def describe_open_ends(estimate: Estimate) -> str:
-    """Describe up to where an interval with an open end holds any value."""
-    if estimate.interval95 is None or not estimate.open_ends:
-        return ""
-    unit = format_unit(estimate.unit)
-    low, high = (f"{end:.4g}{unit}" for end in estimate.interval95)
-    if len(estimate.open_ends) > 1:
-        return f"open on both sides: all values from {low} to {high} fit"
-    if estimate.open_ends == ("upper",):
-        return f"open above: all values from {low} up to its bound fit"
-    return f"open below: all values from {high} down to its bound fit"
+    def _describe_limits(self, estimate: Estimate) -> str:
+        low, high = (f"{end:.4g}{format_unit(estimate.unit)}" for end in self.interval)
+        if len(self.limits) > 1:
+            return f"open below and above: all values from {low} to {high} fit"
+        ((end, name),) = self.limits.items()
+        if end == "upper":
+            side, way = "above", f"from {low} up to {high}"
+        else:
+            side, way = "below", f"from {high} down to {low}"
+        stop = "its bound" if name == estimate.name else f"where {name} meets its bound"
+        return f"open {side}: all values {way} fit, {stop}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,8 @@ others are at their best, and the parameter is at the end. Q is that of
 `sysid.uncertainty.likelihood`. So the profile assumes the same noise as the standard errors, of any
 colour, and of a linear model both intervals are the same.
 
-Where Q stays below the limit up to the bound, the end is *open*: the data say nothing there.
+Where Q stays below the limit up to the bound, the end is *open*: the data say nothing there. It is
+open as well if another parameter meets its bound before: without that, the valley would go on.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +26,7 @@ from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 from sysid.identifiability.exchange import find_ordered_partners
 from sysid.search.least_squares import ScoredSamples, fill_jacobian
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import from_unit, to_unit
+from sysid.simulation.scaling import from_unit, is_at_bounds, to_unit
 from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.estimates import Estimate, IntervalEnd
 from sysid.uncertainty.intervals import ProfileEnds
@@ -79,10 +80,13 @@ class _SpentError(Exception):
 
 
 class _End(NamedTuple):
-    """An end of an interval in unit coordinates; open if Q stays below the limit up to there."""
+    """An end of an interval in unit coordinates.
+
+    It is open if only a bound stops it. `limit` is the parameter with that bound.
+    """
 
     position: float
-    is_open: bool
+    limit: str = ""
 
 
 class _Valley(NamedTuple):
@@ -169,8 +173,8 @@ class _EndSearch:
         values[:, d] = [end.position for end in ends]
         lower, upper = from_unit(self._problem.evaluator, values)[:, d].tolist()
         names: tuple[IntervalEnd, IntervalEnd] = ("lower", "upper")
-        open_ends = tuple(name for name, end in zip(names, ends, strict=True) if end.is_open)
-        return ProfileEnds((lower, upper), open_ends)
+        limits = {name: end.limit for name, end in zip(names, ends, strict=True) if end.limit}
+        return ProfileEnds((lower, upper), limits)
 
     def _find_end(self, d: int, number: int) -> _End:
         """Find the lower end (0) or the upper one (1).
@@ -191,18 +195,32 @@ class _EndSearch:
             if valley.ratio < limit:
                 inside = float(point[d])
                 if inside == max(side, 0.0):
-                    return _End(inside, is_open=True)
+                    return _End(inside, self._problem.free_names[d])
             else:
                 outside = float(point[d])
             step = valley.find_step(side, limit, self._find_longest_step(point, d))
             target = float(np.clip(point[d] + step, 0.0, 1.0))
             if abs(root - 1.0) <= _TOLERANCE:
-                return _End(target, is_open=False)
+                return _End(target, self._name_limit(linear, point, d, limit))
             if not side * inside < side * target < side * outside:
                 target = 0.5 * (inside + outside) if np.isfinite(outside) else target
             point = self._follow(point, valley, d, target - float(point[d]), limit)
             linear = self._linearise(point)
-        return _End(side * max(side * inside, side * self._local_ends[d, number]), is_open=False)
+        return _End(side * max(side * inside, side * self._local_ends[d, number]))
+
+    def _name_limit(self, linear: LinearRatio, point: FloatArray, d: int, limit: float) -> str:
+        """Name another parameter whose bound ends the valley at a point: without it Q is smaller.
+
+        It has met that bound on the way from the estimate. Empty: no bound matters.
+        """
+        is_held = np.logical_or(*is_at_bounds(point)) & ~np.logical_or(*is_at_bounds(self._point))
+        is_held &= self._moves & (np.arange(point.size) != d)
+        if not is_held.any():
+            return ""
+        gain = self._find_valley(linear, np.where(is_held, 0.5, point), d).gain
+        return (
+            self._problem.free_names[int(np.argmax(is_held))] if gain > _LARGE_GAIN * limit else ""
+        )
 
     def _find_longest_step(self, point: FloatArray, d: int) -> float:
         """Find the longest next step: from the estimate, a little beyond its local interval."""
