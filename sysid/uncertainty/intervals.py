@@ -20,7 +20,7 @@
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import hypot, inf, log
+from math import hypot, inf, log, sqrt
 from typing import Protocol
 
 import numpy as np
@@ -180,10 +180,13 @@ class ProfileEnds:
         In the parameter's unit.
     limits : mapping of IntervalEnd to str
         For each open end the parameter whose bound stops it: no data do. Mostly it is its own.
+    is_set : bool
+        Whether values around the estimate all give the same output.
     """
 
     interval: Interval
     limits: Mapping[IntervalEnd, str] = field(default_factory=dict)
+    is_set: bool = False
 
     def apply(self, estimate: Estimate) -> Estimate:
         """Replace the interval.
@@ -192,8 +195,15 @@ class ProfileEnds:
         (2009) 1923).
         """
         found = replace(estimate, interval95=self.interval, open_ends=tuple(self.limits))
-        if not self.limits or estimate.status != "identified":
+        if self.is_set:  # of which each value is as likely: the deviation of a uniform distribution
+            found = replace(found, stderr=(self.interval[1] - self.interval[0]) / sqrt(12.0))
+        if estimate.status != "identified" or not (self.limits or self.is_set):
             return found
+        if not self.limits:
+            low, high = (f"{end:.4g}{format_unit(estimate.unit)}" for end in self.interval)
+            return replace(
+                found, reason=f"it lies between {low} and {high}, where all values fit alike"
+            )
         return replace(found, status="unidentifiable", reason=self._describe_limits(estimate))
 
     def _describe_limits(self, estimate: Estimate) -> str:

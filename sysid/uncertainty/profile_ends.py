@@ -41,6 +41,8 @@ _LARGE_GAIN = 0.5  # of that limit: more gain, and the others move alone
 _MAX_STEPS = 16  # points on the way to an end
 _MAX_GROWTH = 1.5  # of the distance from the estimate: the longest step
 _SHARES = np.array([1.0, 0.5, 0.25, 0.125])  # of a step: those that are tried at once
+_SCALES = (1.0, 1 / 16, 1 / 256)  # of those shares, one after the other
+_RESOLUTION = 0.005  # of the width of a local interval: nearer points are one
 _SIDES = np.array([-1.0, 1.0])  # of an interval
 
 
@@ -75,8 +77,8 @@ def find_profile_ends(
     return FoundEnds(ends, 1 + search.evaluations)
 
 
-class _SpentError(Exception):
-    """No simulations are left."""
+class _StoppedError(Exception):
+    """No simulations are left, or none is finite."""
 
 
 class _End(NamedTuple):
@@ -133,15 +135,15 @@ class _EndSearch:
         self._scored = ScoredSamples(problem.evaluator, rows, problem.evaluator.weight[rows])
         self._theta, self._point = theta, to_unit(problem.evaluator, theta[None])[0]
         self._start = self._linearise(self._point)
-        # A rounded lag moves the output in jumps only: it stays where it is.
+        # The output does not change near a lag on a plateau, which stays where it is.
         self._moves: BoolArray = np.any(self._start.columns != 0.0, axis=0)
-        self._local_ends = np.zeros((theta.size, 2))
+        self._local_ends, self._resolution = np.zeros((theta.size, 2)), np.zeros(theta.size)
 
     def select_doubtful(self, estimates: Sequence[Estimate], correlation: FloatArray) -> list[int]:
         """Select the parameters whose local interval may not hold."""
         errors = np.array([one.stderr or 0.0 for one in estimates])
         at_bound = np.array([one.status == "at bound" for one in estimates])
-        chosen = np.flatnonzero((errors > 0.0) & ~at_bound & self._moves)
+        chosen = np.flatnonzero((errors > 0.0) & ~at_bound)
         if not chosen.size:
             return []
         evaluator, reach = self._problem.evaluator, self._quantiles * errors
@@ -154,6 +156,7 @@ class _EndSearch:
             )
             shares.append(np.abs(ends[:, d] - self._theta[d]) / reach[d])
             self._local_ends[d] = to_unit(evaluator, ends)[:, d]
+            self._resolution[d] = _RESOLUTION * np.ptp(self._local_ends[d])
             steps = self._local_ends[d] - self._point[d]
             points.append(np.clip(self._point + steps[:, None] * valley.turning, 0.0, 1.0))
         ratios = self._compute_ratios(np.concatenate(points)).reshape(-1, 2)
@@ -161,20 +164,21 @@ class _EndSearch:
             roots = np.sqrt(np.maximum(ratios, 0.0)) / self._quantiles[chosen, None]
             is_curved = np.any(np.abs(roots / np.array(shares) - 1.0) > _NOTABLE_CURVATURE, axis=1)
         related = np.abs(correlation[np.ix_(chosen, chosen)]) - np.eye(chosen.size)
-        return chosen[is_curved | np.any(related > _HIGH_CORRELATION, axis=1)].tolist()
+        is_related = np.any(related > _HIGH_CORRELATION, axis=1)
+        return chosen[is_curved | is_related | ~self._moves[chosen]].tolist()
 
     def find_ends(self, d: int) -> ProfileEnds | None:
-        """Find both ends of a parameter; None if the simulations did not suffice."""
+        """Find both ends of a parameter; None if the search stopped before."""
         try:
             ends = [self._find_end(d, i) for i in range(2)]
-        except _SpentError:
+        except _StoppedError:
             return None
         values = np.repeat(self._point[None], 2, axis=0)
         values[:, d] = [end.position for end in ends]
         lower, upper = from_unit(self._problem.evaluator, values)[:, d].tolist()
         names: tuple[IntervalEnd, IntervalEnd] = ("lower", "upper")
         limits = {name: end.limit for name, end in zip(names, ends, strict=True) if end.limit}
-        return ProfileEnds((lower, upper), limits)
+        return ProfileEnds((lower, upper), limits, is_set=not self._moves[d])
 
     def _find_end(self, d: int, number: int) -> _End:
         """Find the lower end (0) or the upper one (1).
@@ -198,6 +202,8 @@ class _EndSearch:
                     return _End(inside, self._problem.free_names[d])
             else:
                 outside = float(point[d])
+            if abs(outside - inside) <= self._resolution[d]:
+                return _End(inside)
             step = valley.find_step(side, limit, self._find_longest_step(point, d))
             target = float(np.clip(point[d] + step, 0.0, 1.0))
             if abs(root - 1.0) <= _TOLERANCE:
@@ -254,10 +260,16 @@ class _EndSearch:
     ) -> FloatArray:
         """Follow the valley by a step, or by the largest share of it where Q is as predicted."""
         move = valley.fixed + step * valley.turning
-        points = self._keep_inside(point + _SHARES[:, None] * move, d)
-        excess = self._compute_ratios(points) - valley.predict_ratios(_SHARES * step)
-        is_near = excess <= limit
-        return np.asarray(points[int(np.argmax(is_near)) if is_near.any() else -1])
+        for scale in _SCALES:
+            shares = scale * _SHARES
+            points = self._keep_inside(point + shares[:, None] * move, d)
+            ratios = self._compute_ratios(points)
+            is_near = ratios - valley.predict_ratios(shares * step) <= limit
+            if is_near.any():
+                return np.asarray(points[int(np.argmax(is_near))])
+        if not np.isfinite(ratios[-1]):
+            raise _StoppedError
+        return np.asarray(points[-1])
 
     def _move_others(self, point: FloatArray, valley: _Valley, d: int) -> FloatArray:
         """Move the others towards their best values, by the share of the step that gains most.
@@ -299,5 +311,5 @@ class _EndSearch:
 
     def _spend(self, simulations: int) -> None:
         if self.evaluations + simulations > self._most:
-            raise _SpentError
+            raise _StoppedError
         self.evaluations += simulations
