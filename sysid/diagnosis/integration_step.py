@@ -88,9 +88,9 @@ def compare_half_step(
     None if there is no such comparison: a recursion, too long a simulation, no sensitivities. One
     simulation is always run. If the budget or the time is over, the change is predicted.
     """
-    if not _can_halve(problem) or analysis.residuals_and_sensitivities is None:
+    if not can_halve_step(problem) or analysis.residuals_and_sensitivities is None:
         return None
-    fine = _halve_step(problem)
+    fine = halve_step(problem)
     error, columns = analysis.residuals_and_sensitivities
     with np.errstate(all="ignore"):  # what diverges with one of the steps
         residual = fine.compute_residuals(theta[None])[0]
@@ -138,7 +138,7 @@ def find_limit(
 ) -> str:
     """Name the limit that forbids a fit with half the step; empty if there is none."""
     fine = half.problem
-    if not _can_halve(fine):
+    if not can_halve_step(fine):
         limit = f"{MAX_SUBSTEPS} substeps or {_MAX_STEPS:,} steps of a simulation"
     elif is_late is not None and is_late():
         limit = "the time limit"
@@ -234,7 +234,8 @@ def _spread(champions: Sequence[FloatArray]) -> Sequence[FloatArray]:
     return champions[::-1][::step]
 
 
-def _can_halve(problem: Problem) -> bool:
+def can_halve_step(problem: Problem) -> bool:
+    """Whether half the integration step is possible, and a simulation with it is not too long."""
     return (
         not is_difference(problem.model)
         and _FACTOR * problem.n_steps <= _MAX_STEPS
@@ -242,7 +243,7 @@ def _can_halve(problem: Problem) -> bool:
     )
 
 
-def _halve_step(problem: Problem) -> Problem:
+def halve_step(problem: Problem) -> Problem:
     """Make the same problem with half the integration step."""
     model = problem.untied_model
     return problem.rebuild(model=replace_substeps(model, _FACTOR * model.solver.substeps))

@@ -15,10 +15,12 @@ from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.diagnosis.integration_step import (
     HalfStep,
+    can_halve_step,
     choose_starts,
     compare_half_step,
     compute_work_limit,
     find_limit,
+    halve_step,
     mark_changing,
 )
 from sysid.diagnosis.unrecorded_input import RecordedComparison, compare_where_recorded
@@ -71,11 +73,12 @@ from sysid.simulation.problem import Problem, compute_metrics
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.intervals import (
+    ProfileEnds,
     compose_intervals,
     keep_in_bounds,
     mark_poor_intervals,
 )
-from sysid.uncertainty.profile_ends import find_profile_ends
+from sysid.uncertainty.profile_ends import FoundEnds, extrapolate_ends, find_profile_ends
 from sysid.uncertainty.unequal_noise import fit_unequal_noise
 
 _MOST_PROJECTED = 6000  # simulations of a scan by projection
@@ -431,13 +434,30 @@ class _EstimateSearch:
         most = count_affordable_simulations(self.problem, self._deadline.is_over())
         found = find_profile_ends(self.problem, theta, self.analysis, self._budget.cap(most))
         self._budget.spend(found.evaluations)
+        ends = {**found.by_name, **self._extrapolate_sets(theta, found, most - found.evaluations)}
         beyond = {
-            name: self.analysis.minima[name].select_beyond(ends.interval)
-            for name, ends in found.by_name.items()
+            name: self.analysis.minima[name].select_beyond(one.interval)
+            for name, one in ends.items()
             if name in self.analysis.minima
         }
-        estimates = compose_intervals(self.analysis.estimates, found.by_name, beyond)
+        estimates = compose_intervals(self.analysis.estimates, ends, beyond)
         self.analysis = replace(self.analysis, estimates=estimates)
+
+    def _extrapolate_sets(
+        self, theta: FloatArray, found: FoundEnds, most: int
+    ) -> dict[str, ProfileEnds]:
+        """Extrapolate the ends of sets of values that fit alike to an infinitely fine step."""
+        sets = {name: ends for name, ends in found.by_name.items() if ends.is_set}
+        if not sets or not can_halve_step(self.problem):
+            return {}
+        most = self._budget.cap(most)
+        half = find_profile_ends(halve_step(self.problem), theta, self.analysis, most, sets)
+        self._budget.spend(half.evaluations)
+        return {
+            name: extrapolate_ends(sets[name], ends)
+            for name, ends in half.by_name.items()
+            if ends.is_set
+        }
 
     def _is_late(self) -> bool:
         """Whether no search may begin: the paper's methods have none."""

@@ -180,31 +180,40 @@ class ProfileEnds:
         In the parameter's unit.
     limits : mapping of IntervalEnd to str
         For each open end the parameter whose bound stops it: no data do. Mostly it is its own.
+    is_closed : bool
+        Whether the data end it on both sides.
     is_set : bool
         Whether values around the estimate all give the same output.
     """
 
     interval: Interval
     limits: Mapping[IntervalEnd, str] = field(default_factory=dict)
+    is_closed: bool = True
     is_set: bool = False
 
     def apply(self, estimate: Estimate) -> Estimate:
-        """Replace the interval.
+        """Replace the interval, and the status if that of the linear model does not hold.
 
-        A parameter with an open end is practically not identifiable (Raue et al., Bioinformatics 25
-        (2009) 1923).
+        A parameter is practically identifiable if its profile is closed, and not if an end is open
+        (Raue et al., Bioinformatics 25 (2009) 1923).
         """
         found = replace(estimate, interval95=self.interval, open_ends=tuple(self.limits))
-        if self.is_set:  # of which each value is as likely: the deviation of a uniform distribution
-            found = replace(found, stderr=(self.interval[1] - self.interval[0]) / sqrt(12.0))
-        if estimate.status != "identified" or not (self.limits or self.is_set):
+        is_flat = self.is_closed and estimate.status == "unidentifiable"
+        if self.is_set or is_flat:  # in the worst case all values are as likely
+            stderr = (self.interval[1] - self.interval[0]) / sqrt(12.0)
+            found = replace(found, stderr=stderr)
+        if is_flat:
+            found = replace(found, status="identified", reason="")
+        if found.status != "identified":
             return found
-        if not self.limits:
+        if self.limits:
+            reason = self._describe_limits(estimate)
+            return replace(found, status="unidentifiable", reason=reason)
+        if self.is_set:
             low, high = (f"{end:.4g}{format_unit(estimate.unit)}" for end in self.interval)
-            return replace(
-                found, reason=f"it lies between {low} and {high}, where all values fit alike"
-            )
-        return replace(found, status="unidentifiable", reason=self._describe_limits(estimate))
+            reason = f"it lies between {low} and {high}, where all values fit alike"
+            return replace(found, reason=reason)
+        return found
 
     def _describe_limits(self, estimate: Estimate) -> str:
         low, high = (f"{end:.4g}{format_unit(estimate.unit)}" for end in self.interval)

@@ -17,7 +17,8 @@ Where Q stays below the limit up to the bound, the end is *open*: the data say n
 open as well if another parameter meets its bound before: without that, the valley would go on.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -54,11 +55,16 @@ class FoundEnds(NamedTuple):
 
 
 def find_profile_ends(
-    problem: Problem, theta: FloatArray, analysis: Analysis, max_simulations: int
+    problem: Problem,
+    theta: FloatArray,
+    analysis: Analysis,
+    max_simulations: int,
+    names: Collection[str] | None = None,
 ) -> FoundEnds:
     """Find the ends of intervals around an estimate (D,) that those of the linear model miss.
 
-    When `max_simulations` are spent, the other intervals stay as they are.
+    When `max_simulations` are spent, the other intervals stay as they are. So do those of
+    parameters that are not among the `names`, if these are given.
     """
     model, uncertainty = analysis.likelihood, analysis.uncertainty
     d = theta.size
@@ -71,10 +77,23 @@ def find_profile_ends(
     search = _EndSearch(problem, theta, analysis, model, max_simulations - 1)
     ends = {}
     for d in search.select_doubtful(estimates, uncertainty.correlation):
-        found = search.find_ends(d)
+        name = problem.free_names[d]
+        found = search.find_ends(d) if names is None or name in names else None
         if found is not None:
-            ends[problem.free_names[d]] = found
+            ends[name] = found
     return FoundEnds(ends, 1 + search.evaluations)
+
+
+def extrapolate_ends(coarse: ProfileEnds, fine: ProfileEnds) -> ProfileEnds:
+    """Extrapolate the ends of a set from those with a step of the integration and with half of it.
+
+    A held input jumps, and the jump is spread over a step. So the set is too small by a part of the
+    step at either end (Richardson's extrapolation). A rounded lag has a set that shrinks with the
+    step, and keeps its own.
+    """
+    (low, high), (lower, upper) = coarse.interval, fine.interval
+    ends = min(low, 2.0 * lower - low), max(high, 2.0 * upper - high)
+    return replace(coarse, interval=ends)
 
 
 class _StoppedError(Exception):
@@ -84,11 +103,13 @@ class _StoppedError(Exception):
 class _End(NamedTuple):
     """An end of an interval in unit coordinates.
 
-    It is open if only a bound stops it. `limit` is the parameter with that bound.
+    It is open if only a bound stops it. `limit` is the parameter with that bound. If the steps did
+    not suffice, it `is_rough`: a point inside.
     """
 
     position: float
     limit: str = ""
+    is_rough: bool = False
 
 
 class _Valley(NamedTuple):
@@ -178,7 +199,8 @@ class _EndSearch:
         lower, upper = from_unit(self._problem.evaluator, values)[:, d].tolist()
         names: tuple[IntervalEnd, IntervalEnd] = ("lower", "upper")
         limits = {name: end.limit for name, end in zip(names, ends, strict=True) if end.limit}
-        return ProfileEnds((lower, upper), limits, is_set=not self._moves[d])
+        is_closed = not (limits or any(end.is_rough for end in ends))
+        return ProfileEnds((lower, upper), limits, is_closed, is_set=not self._moves[d])
 
     def _find_end(self, d: int, number: int) -> _End:
         """Find the lower end (0) or the upper one (1).
@@ -212,7 +234,7 @@ class _EndSearch:
                 target = 0.5 * (inside + outside) if np.isfinite(outside) else target
             point = self._follow(point, valley, d, target - float(point[d]), limit)
             linear = self._linearise(point)
-        return _End(side * max(side * inside, side * self._local_ends[d, number]))
+        return _End(side * max(side * inside, side * self._local_ends[d, number]), is_rough=True)
 
     def _name_limit(self, linear: LinearRatio, point: FloatArray, d: int, limit: float) -> str:
         """Name another parameter whose bound ends the valley at a point: without it Q is smaller.
