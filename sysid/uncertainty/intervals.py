@@ -220,12 +220,12 @@ class ProfileEnds:
         if len(self.limits) > 1:
             return f"open below and above: all values from {low} to {high} fit"
         ((end, name),) = self.limits.items()
-        if end == "upper":
-            side, way = "above", f"from {low} up to {high}"
-        else:
-            side, way = "below", f"from {high} down to {low}"
-        stop = "its bound" if name == estimate.name else f"where {name} meets its bound"
-        return f"open {side}: all values {way} fit, {stop}"
+        side, start, stop = ("above", low, high) if end == "upper" else ("below", high, low)
+        way = "up" if end == "upper" else "down"
+        if name == estimate.name:
+            return f"open {side}: all values from {start} {way} to its bound {stop} fit"
+        values = f"all values from {start} {way} to {stop} fit"
+        return f"open {side}: {values}, where {name} meets its bound"
 
 
 @dataclass(frozen=True, slots=True)

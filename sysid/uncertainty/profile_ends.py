@@ -186,7 +186,8 @@ class _EndSearch:
             is_curved = np.any(np.abs(roots / np.array(shares) - 1.0) > _NOTABLE_CURVATURE, axis=1)
         related = np.abs(correlation[np.ix_(chosen, chosen)]) - np.eye(chosen.size)
         is_related = np.any(related > _HIGH_CORRELATION, axis=1)
-        return chosen[is_curved | is_related | ~self._moves[chosen]].tolist()
+        is_doubtful = is_curved | is_related | ~self._moves[chosen]
+        return [int(d) for d in chosen[is_doubtful]]
 
     def find_ends(self, d: int) -> ProfileEnds | None:
         """Find both ends of a parameter; None if the search stopped before."""
@@ -246,9 +247,8 @@ class _EndSearch:
         if not is_held.any():
             return ""
         gain = self._find_valley(linear, np.where(is_held, 0.5, point), d).gain
-        return (
-            self._problem.free_names[int(np.argmax(is_held))] if gain > _LARGE_GAIN * limit else ""
-        )
+        name = self._problem.free_names[int(np.argmax(is_held))]
+        return name if gain > _SMALL_GAIN * limit else ""
 
     def _find_longest_step(self, point: FloatArray, d: int) -> float:
         """Find the longest next step: from the estimate, a little beyond its local interval."""
