@@ -309,7 +309,7 @@ class ComparedValueDocument(TypedDict):
     stderr: float | None
     """standard error, in `unit`. If there is none, `reason` says why"""
     interval95: list[float | None] | None
-    """both ends of the 95 % interval by the t distribution, in `unit`"""
+    """both ends of the 95 % interval, in `unit`"""
     status: Literal[
         "identified",
         "not settled",
@@ -328,6 +328,8 @@ class ComparedValueDocument(TypedDict):
     """identified, or why the value is not to be relied on"""
     reason: str
     """reason of the status, or of a missing standard error; empty if there is nothing to say"""
+    open_ends: list[Literal["lower", "upper"]]
+    """ends of the interval up to which the data speak for any value; there it ends at the bound"""
 
 class ComparisonDocument(TypedDict):
     """Comparison of runs, the best first; `unit` is that of the RMS."""
@@ -545,7 +547,7 @@ class EstimateDocument(TypedDict):
     stderr: float | None
     """standard error, in `unit`. If there is none, `reason` says why"""
     interval95: list[float | None] | None
-    """both ends of the 95 % interval by the t distribution, in `unit`"""
+    """both ends of the 95 % interval, in `unit`"""
     status: Literal[
         "identified",
         "not settled",
@@ -564,6 +566,8 @@ class EstimateDocument(TypedDict):
     """identified, or why the value is not to be relied on"""
     reason: str
     """reason of the status, or of a missing standard error; empty if there is nothing to say"""
+    open_ends: list[Literal["lower", "upper"]]
+    """ends of the interval up to which the data speak for any value; there it ends at the bound"""
 
 class ExperimentDocument(TypedDict):
     """Measured and simulated outputs of one experiment."""
