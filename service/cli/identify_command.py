@@ -13,6 +13,7 @@ import typer
 
 from service.cli.common import (
     DATA_HELP,
+    ESTIMATE_HEADINGS,
     MODEL_SUFFIXES,
     OUTPUT_PANEL,
     STANDARD_INPUT,
@@ -25,12 +26,11 @@ from service.cli.common import (
     Segments,
     apply_setting,
     check_file,
-    describe_status,
     err,
     fail,
     fail_usage,
     file_origins,
-    format_estimate,
+    list_estimate_cells,
     name_file,
     out,
     parse_channels,
@@ -371,16 +371,8 @@ def print_result(
         print_json(document)
         return
     print_table(
-        ("parameter", ">estimate ± standard error", "unit", "status"),
-        (
-            (
-                parameter["name"],
-                format_estimate(parameter),
-                parameter["unit"],
-                describe_status(parameter),
-            )
-            for parameter in document["parameters"]
-        ),
+        ESTIMATE_HEADINGS,
+        map(list_estimate_cells, document["parameters"]),
         empty="no parameters",
     )
     unit = plain_unit(find_output_unit(result))
