@@ -103,8 +103,9 @@ def format_interval(
 
     Of `open_ends`, ``lower`` or ``upper``, only a bound is known: they are "open".
     """
-    shown = _find_shown_ends(ends, status, open_ends)
-    return _join_ends(shown, " … ", lambda end: format_estimate(end, stderr)[0])
+    return " … ".join(
+        _write_ends(ends, status, open_ends, lambda end: format_estimate(end, stderr)[0])
+    )
 
 
 def plain_interval(
@@ -115,28 +116,27 @@ def plain_interval(
     open_ends: Collection[str] = (),
 ) -> str:
     """Format a 95 % interval as `format_interval` does, for terminals and notes."""
-    shown = _find_shown_ends(ends, status, open_ends)
-    return _join_ends(shown, " to ", lambda end: split_estimate(end, stderr)[0])
+    return " to ".join(
+        _write_ends(ends, status, open_ends, lambda end: split_estimate(end, stderr)[0])
+    )
 
 
-def _find_shown_ends(
-    ends: Sequence[float | None] | None, status: str, open_ends: Collection[str]
-) -> list[float | None]:
-    """Find the ends that are shown; None is open. An empty list: there is no interval."""
+def _write_ends(
+    ends: Sequence[float | None] | None,
+    status: str,
+    open_ends: Collection[str],
+    write: Callable[[float], str],
+) -> list[str]:
+    """Write both ends of an interval; none without one, and one dash if neither is finite."""
     if ends is None or status in _WITHOUT_ERROR:
         return []
+    known = [end is not None and math.isfinite(end) for end in ends]
+    if not any(known):
+        return [DASH]
     return [
-        None if name in open_ends or end is None or not math.isfinite(end) else end
-        for name, end in zip(("lower", "upper"), ends, strict=True)
+        "open" if name in open_ends else DASH if end is None or not is_known else write(end)
+        for name, end, is_known in zip(("lower", "upper"), ends, known, strict=True)
     ]
-
-
-def _join_ends(ends: Sequence[float | None], joint: str, write: Callable[[float], str]) -> str:
-    if not ends:
-        return ""
-    if all(end is None for end in ends):
-        return DASH
-    return joint.join("open" if end is None else write(end) for end in ends)
 
 
 def format_criterion(value: float | None) -> str:
