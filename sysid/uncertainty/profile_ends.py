@@ -248,7 +248,7 @@ class _EndSearch:
             return ""
         gain = self._find_valley(linear, np.where(is_held, 0.5, point), d).gain
         name = self._problem.free_names[int(np.argmax(is_held))]
-        return name if gain > _SMALL_GAIN * limit else ""
+        return name if gain > _LARGE_GAIN * limit else ""
 
     def _find_longest_step(self, point: FloatArray, d: int) -> float:
         """Find the longest next step: from the estimate, a little beyond its local interval."""
