@@ -21,7 +21,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import hypot, inf, log, sqrt
-from typing import Protocol
+from typing import Protocol, get_args
 
 import numpy as np
 
@@ -30,10 +30,11 @@ from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.language.functions import Interval
 from sysid.models.parameters import Parameter
-from sysid.uncertainty.estimates import Estimate, IntervalEnd
+from sysid.uncertainty.estimates import Estimate, EstimateStatus, IntervalEnd
 
 _TAIL = 0.025  # of the distribution, beyond each end of an interval
 _POOR_SHARE = 1 / 3  # of a range: an interval around 0 that covers more says little
+_ENDS: tuple[IntervalEnd, ...] = get_args(IntervalEnd)
 _HALVINGS = 60  # of the range of a quantile: to the resolution of a number
 
 
@@ -195,7 +196,8 @@ class ProfileEnds:
         """Replace the interval, and the status if that of the linear model does not hold.
 
         A parameter is practically identifiable if its profile is closed, and not if an end is open
-        (Raue et al., Bioinformatics 25 (2009) 1923).
+        (Raue et al., Bioinformatics 25 (2009) 1923). If that end is towards 0, it is still known
+        how large the parameter may be, as of any interval that holds 0.
         """
         found = replace(estimate, interval95=self.interval, open_ends=tuple(self.limits))
         is_flat = self.is_closed and estimate.status == "unidentifiable"
@@ -207,8 +209,10 @@ class ProfileEnds:
         if found.status != "identified":
             return found
         if self.limits:
-            reason = self._describe_limits(estimate)
-            return replace(found, status="unidentifiable", reason=reason)
+            ends = dict(zip(_ENDS, self.interval, strict=True))
+            is_unlimited = any(abs(ends[name]) > abs(estimate.value) for name in self.limits)
+            status: EstimateStatus = "unidentifiable" if is_unlimited else "identified"
+            return replace(found, status=status, reason=self._describe_limits(estimate))
         if self.is_set:
             low, high = (f"{end:.4g}{format_unit(estimate.unit)}" for end in self.interval)
             reason = f"it lies between {low} and {high}, where all values fit alike"

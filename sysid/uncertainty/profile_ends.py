@@ -19,7 +19,7 @@ open as well if another parameter meets its bound before: without that, the vall
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -67,13 +67,13 @@ def find_profile_ends(
     parameters that are not among the `names`, if these are given.
     """
     model, uncertainty = analysis.likelihood, analysis.uncertainty
-    d = theta.size
-    if model is None or uncertainty is None or max_simulations < 3 * d + 2:
+    by_name = {one.name: one for one in analysis.estimates}
+    estimates = [by_name[name] for name in problem.free_names]
+    has_none = not any(one.stderr and one.status != "at bound" for one in estimates)
+    if model is None or uncertainty is None or has_none or max_simulations < 3 * theta.size + 2:
         return FoundEnds({}, 0)
     if float(problem.evaluate_fitness(theta[None])[0]) <= _ROUNDING_RMS * problem.output_scale:
         return FoundEnds({}, 1)
-    by_name = {one.name: one for one in analysis.estimates}
-    estimates = [by_name[name] for name in problem.free_names]
     search = _EndSearch(problem, theta, analysis, model, max_simulations - 1)
     ends = {}
     for d in search.select_doubtful(estimates, uncertainty.correlation):
@@ -165,8 +165,6 @@ class _EndSearch:
         errors = np.array([one.stderr or 0.0 for one in estimates])
         at_bound = np.array([one.status == "at bound" for one in estimates])
         chosen = np.flatnonzero((errors > 0.0) & ~at_bound)
-        if not chosen.size:
-            return []
         evaluator, reach = self._problem.evaluator, self._quantiles * errors
         points, shares = [], []
         for d in chosen.tolist():
@@ -198,8 +196,10 @@ class _EndSearch:
         values = np.repeat(self._point[None], 2, axis=0)
         values[:, d] = [end.position for end in ends]
         lower, upper = from_unit(self._problem.evaluator, values)[:, d].tolist()
-        names: tuple[IntervalEnd, IntervalEnd] = ("lower", "upper")
-        limits = {name: end.limit for name, end in zip(names, ends, strict=True) if end.limit}
+        limits = dict[IntervalEnd, str]()
+        for name, end in zip(get_args(IntervalEnd), ends, strict=True):
+            if end.limit:
+                limits[name] = end.limit
         is_closed = not (limits or any(end.is_rough for end in ends))
         return ProfileEnds((lower, upper), limits, is_closed, is_set=not self._moves[d])
 
