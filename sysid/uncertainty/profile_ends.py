@@ -13,6 +13,10 @@ others are at their best, and the parameter is at the end. Q is that of
 `sysid.uncertainty.likelihood`. So the profile assumes the same noise as the standard errors, of any
 colour, and of a linear model both intervals are the same.
 
+Near a parameter on a plateau the output moves in jumps, if at all. The likelihood ratio at the true
+place of a jump follows the larger of two exponential variables then, not χ²: its 95 % quantile is
+-2 ln(1 - √0.95) = 7.35 (Hansen, Econometrica 68 (2000) 575).
+
 Where Q stays below the limit up to the bound, the end is *open*: the data say nothing there. It is
 open as well if another parameter meets its bound before: without that, the valley would go on.
 """
@@ -23,6 +27,7 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
+from sysid.core.distributions import CHI_SQUARE_95
 from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 from sysid.identifiability.exchange import find_ordered_partners
 from sysid.search.least_squares import ScoredSamples, fill_jacobian
@@ -43,7 +48,8 @@ _MAX_STEPS = 16  # points on the way to an end
 _MAX_GROWTH = 1.5  # of the distance from the estimate: the longest step
 _SHARES = np.array([1.0, 0.5, 0.25, 0.125])  # of a step: those that are tried at once
 _SCALES = (1.0, 1 / 16, 1 / 256)  # of those shares, one after the other
-_RESOLUTION = 0.005  # of the width of a local interval: nearer points are one
+_RESOLUTION = 5e-4  # of the width of a local interval: nearer points are one
+_JUMP_LIMIT = 7.352 / CHI_SQUARE_95  # times the limit of Q, where the output moves in jumps
 _SIDES = np.array([-1.0, 1.0])  # of an interval
 
 
@@ -208,7 +214,7 @@ class _EndSearch:
 
         If the steps do not suffice, it is the furthest point inside, or the local end.
         """
-        side, limit = float(_SIDES[number]), float(self._quantiles[d]) ** 2
+        side, limit = float(_SIDES[number]), self._compute_limit(d)
         point, linear = self._point, self._start
         inside, outside = float(point[d]), side * np.inf
         for _ in range(_MAX_STEPS):
@@ -236,6 +242,10 @@ class _EndSearch:
             point = self._follow(point, valley, d, target - float(point[d]), limit)
             linear = self._linearise(point)
         return _End(side * max(side * inside, side * self._local_ends[d, number]), is_rough=True)
+
+    def _compute_limit(self, d: int) -> float:
+        """Compute the value of Q at an end."""
+        return float(self._quantiles[d]) ** 2 * (1.0 if self._moves[d] else _JUMP_LIMIT)
 
     def _name_limit(self, linear: LinearRatio, point: FloatArray, d: int, limit: float) -> str:
         """Name another parameter whose bound ends the valley at a point: without it Q is smaller.
