@@ -26,6 +26,7 @@ from typing import Protocol, get_args
 import numpy as np
 
 from sysid.core.distributions import student_limit, student_tail
+from sysid.core.text import split_estimate
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.language.functions import Interval
@@ -214,8 +215,9 @@ class ProfileEnds:
             status: EstimateStatus = "unidentifiable" if is_unlimited else "identified"
             return replace(found, status=status, reason=self._describe_limits(estimate))
         if self.is_set:
-            low, high = (f"{end:.4g}{format_unit(estimate.unit)}" for end in self.interval)
-            reason = f"it lies between {low} and {high}, where all values fit alike"
+            low, high = (split_estimate(end, found.stderr)[0] for end in self.interval)
+            unit = format_unit(estimate.unit)
+            reason = f"it lies between {low}{unit} and {high}{unit}, where all values fit alike"
             return replace(found, reason=reason)
         return found
 

@@ -207,7 +207,7 @@ def test_a_lag_that_moves_the_output_at_whole_samples_only_lies_between_two(lag:
     assert found.interval95 == pytest.approx((9.0, 10.0), abs=0.01)
     assert found.stderr == pytest.approx(1.0 / np.sqrt(12.0), rel=0.02)
     assert (found.status, found.open_ends) == ("identified", ())
-    assert found.reason == "it lies between 9 s and 10 s, where all values fit alike"
+    assert found.reason == "it lies between 9.00 s and 10.00 s, where all values fit alike"
 
 
 def test_a_rounded_lag_lies_between_the_ends_of_its_plateau() -> None:
