@@ -317,6 +317,7 @@ class ComparedValueDocument(TypedDict):
         "order-dependent",
         "prediction-dependent",
         "hold-dependent",
+        "selection-dependent",
         "ambiguous",
         "group",
         "at bound",
@@ -553,6 +554,7 @@ class EstimateDocument(TypedDict):
         "order-dependent",
         "prediction-dependent",
         "hold-dependent",
+        "selection-dependent",
         "ambiguous",
         "group",
         "at bound",
@@ -1676,6 +1678,12 @@ class SelectedTermDocument(TypedDict):
     """share explained with all terms so far"""
     coefficient: float | None
     """coefficient in the model of all selected terms, before the search. It comes from one-step least squares, or from the free run if that selected the terms. Its unit follows from the term"""
+    probability: float | None
+    """probability that the term belongs to the model, by the weights of the selections that differ by one term"""
+    move: float | None
+    """largest move of the coefficient by such a selection that counts, in standard errors"""
+    rival: str
+    """that selection, or the likeliest without the term: the change in words. Empty if none counts"""
 
 class SequenceInDocument(TypedDict):
     """The sequence search."""

@@ -21,6 +21,7 @@ from sysid.diagnosis.input_hold import (
     refit_other_holds,
 )
 from sysid.diagnosis.integration_step import explain_finer_step
+from sysid.diagnosis.open_terms import mark_selection_dependent
 from sysid.diagnosis.process_order import (
     compare_orders,
     mark_order_dependent,
@@ -139,6 +140,7 @@ def _build_identification(
     limit = algorithm.safe_limit
     evidence = assess_search(problem, state, metrics.rms, tests, minima)
     settled = mark_unsettled(mark_ambiguous(problem, analysis.estimates, minima), evidence)
+    settled = mark_selection_dependent(settled, problem.model)
     analysis = replace(analysis, estimates=mark_refuted(settled, validated))
     holds = list_input_holds(problem)
     if is_refining(algorithm, len(best.ends)):

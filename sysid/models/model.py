@@ -10,7 +10,7 @@ from sysid.language.tree import Expression, PastValue
 from sysid.models.parameters import BoundsRule, Parameter
 
 Criterion = Literal["none", "bic"]
-ErrorKind = Literal["one-step", "simulation"]
+ErrorKind = Literal["auto", "one-step", "simulation"]
 MAX_SUBSTEPS = 1000
 """Most integration steps in one grid step."""
 
@@ -48,15 +48,26 @@ class TermRule:
         ``bic``: choose the number of terms with the smallest Bayesian information criterion.
     exchange : bool
         Whether a selected term may be replaced by a better one afterwards.
-    error : {"one-step", "simulation"}
-        Error that the terms explain; ``simulation`` starts from the one-step selection.
+    error : {"auto", "one-step", "simulation"}
+        Error that the terms explain. ``simulation`` starts from the one-step selection; ``auto``
+        takes the one of the two that predicts better.
     """
 
     keep: int
     err: float | None = None
     criterion: Criterion = "none"
     exchange: bool = True
-    error: ErrorKind = "one-step"
+    error: ErrorKind = "auto"
+
+    @property
+    def is_fixed_number(self) -> bool:
+        """Whether `keep` is the number of terms, not a limit."""
+        return self.err is None and self.criterion == "none"
+
+    @property
+    def demand(self) -> "TermRule":
+        """The rule for the terms that the data demand, at most `keep`."""
+        return replace(self, criterion="bic") if self.is_fixed_number else self
 
 
 class SelectedTerm(NamedTuple):
@@ -75,12 +86,23 @@ class SelectedTerm(NamedTuple):
         Coefficient in the model of all selected terms, before the search. It comes from one-step
         least squares, or from the free run if that selected the terms. Its unit follows from the
         term.
+    probability : float
+        Probability that the term belongs to the model, by the weights of the selections that differ
+        by one term.
+    move : float
+        Largest move of the coefficient by such a selection that counts, in standard errors.
+    rival : str
+        That selection, or the likeliest without the term: the change in words. Empty if none
+        counts.
     """
 
     term: str
     err: float
     cumulated: float
     coefficient: float
+    probability: float
+    move: float
+    rival: str
 
 
 @dataclass(frozen=True, slots=True)

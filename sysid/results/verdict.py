@@ -10,6 +10,7 @@ from math import isfinite, isnan
 from typing import TYPE_CHECKING, Literal, TypeGuard
 
 from sysid.core.text import plain_estimate, plain_unit
+from sysid.results.open_terms import find_open_terms
 
 if TYPE_CHECKING:  # the client's types name `Trust`, and load no numerics
     from sysid.residuals.residual_tests import ResidualTest
@@ -23,7 +24,7 @@ Severity = Literal["note", "caution", "serious"]
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
 _UNLIKELY = 1e-3  # probability of such residuals under a true model
 _SEPARABLE_STDERRS = 2.0  # a smaller time lag is not distinguishable from 0
-_DEPENDENT = "order-dependent", "prediction-dependent", "hold-dependent"
+_DEPENDENT = "order-dependent", "prediction-dependent", "hold-dependent", "selection-dependent"
 _LITTLE = 30.0  # %: a smaller fit is serious if the residuals are not noise
 _NOTABLE_LOSS = 20.0  # percentage points of fit, from estimation to validation
 
@@ -418,6 +419,7 @@ _FINDERS: tuple[Callable[[Evidence], Iterator[Reason]], ...] = (
     _find_undetermined,
     _find_other_order,
     _find_other_hold,
+    find_open_terms,
     _find_missing_dynamics,
     _find_insignificant_delays,
 )

@@ -15,6 +15,7 @@ EstimateStatus = Literal[
     "order-dependent",
     "prediction-dependent",
     "hold-dependent",
+    "selection-dependent",
     "ambiguous",
     "group",
     "at bound",
