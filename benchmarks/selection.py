@@ -111,15 +111,16 @@ def write_term(term: Monomial) -> str:
 
 def respond(system: System, inputs: dict[str, FloatArray], errors: FloatArray) -> FloatArray:
     """Output of the system, with errors in its equation."""
-    signals = {name: values.tolist() for name, values in inputs.items()}
-    signals["y"] = y = [0.0] * errors.size
     first = max(lag for lags in system.lags.values() for lag in lags)
+    signals = {name: [0.0] * first + values.tolist() for name, values in inputs.items()}
+    errors = np.concatenate([np.zeros(first), errors])
+    signals["y"] = y = [0.0] * errors.size
     for k in range(first, errors.size):
         y[k] = float(errors[k]) + sum(
             value * prod(signals[name][k - lag] for name, lag in term)
             for term, value in system.truth.items()
         )
-    return np.array(y)
+    return np.array(y[first:])
 
 
 def draw_record(system: System, noise: str, seed: int) -> Record:

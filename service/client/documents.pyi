@@ -1679,11 +1679,11 @@ class SelectedTermDocument(TypedDict):
     coefficient: float | None
     """coefficient in the model of all selected terms, before the search. It comes from one-step least squares, or from the free run if that selected the terms. Its unit follows from the term"""
     probability: float | None
-    """probability that the term belongs to the model, by the weights of the selections that differ by one term"""
-    move: float | None
-    """largest move of the coefficient by such a selection that counts, in standard errors"""
+    """probability that the term belongs to the model: the weight of the selections with it"""
+    coverage: float | None
+    """probability that the 95 % interval of the coefficient holds, over all these selections"""
     rival: str
-    """that selection, or the likeliest without the term: the change in words. Empty if none counts"""
+    """the likeliest other selection: the change in words. Empty if term and coefficient are certain"""
 
 class SequenceInDocument(TypedDict):
     """The sequence search."""

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from sysid.models.model import Model, SelectedTerm
-from sysid.selection.term_odds import CERTAIN, MOST_MOVE
+from sysid.selection.term_odds import CERTAIN, LEAST_COVERAGE
 from sysid.uncertainty.estimates import Estimate
 
 
@@ -22,15 +22,18 @@ def mark_selection_dependent(estimates: tuple[Estimate, ...], model: Model) -> t
 def _explain_doubt(term: SelectedTerm) -> str:
     """Explain why a coefficient depends on the selection; empty if it does not."""
     if term.probability < CERTAIN:
-        percent = max(100.0 * term.probability, 0.0)
-        least = "less than 1" if percent < 1.0 else f"{percent:.0f}"
         return (
-            f"the term belongs to the model with a probability of {least} %; "
-            f"{term.rival} the data may be explained as well"
+            f"the term belongs to the model with a probability of "
+            f"{_write_percent(term.probability)}; the likeliest selection against it is "
+            f"{term.rival}"
         )
-    if term.move > MOST_MOVE:
+    if term.coverage < LEAST_COVERAGE:
         return (
-            f"between selections of terms that explain the data it varies by {term.move:.1f} "
-            f"standard errors; one is {term.rival}"
+            f"over all selections that may be true its 95 % interval holds in "
+            f"{_write_percent(term.coverage)}; the one that moves it most is {term.rival}"
         )
     return ""
+
+
+def _write_percent(share: float) -> str:
+    return "less than 1 %" if share < 0.01 else f"{100.0 * share:.0f} %"

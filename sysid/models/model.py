@@ -87,13 +87,12 @@ class SelectedTerm(NamedTuple):
         least squares, or from the free run if that selected the terms. Its unit follows from the
         term.
     probability : float
-        Probability that the term belongs to the model, by the weights of the selections that differ
-        by one term.
-    move : float
-        Largest move of the coefficient by such a selection that counts, in standard errors.
+        Probability that the term belongs to the model: the weight of the selections with it.
+    coverage : float
+        Probability that the 95 % interval of the coefficient holds, over all these selections.
     rival : str
-        That selection, or the likeliest without the term: the change in words. Empty if none
-        counts.
+        The likeliest other selection: the change in words. Empty if term and coefficient are
+        certain.
     """
 
     term: str
@@ -101,7 +100,7 @@ class SelectedTerm(NamedTuple):
     cumulated: float
     coefficient: float
     probability: float
-    move: float
+    coverage: float
     rival: str
 
 

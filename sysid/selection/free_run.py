@@ -16,6 +16,7 @@ leave less.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -24,7 +25,8 @@ import numpy as np
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
-from sysid.models.model import TermRule
+from sysid.data.records import Record
+from sysid.models.model import Model, TermRule
 from sysid.residuals.series import iterate_parts
 from sysid.search.refine import refine_candidates
 from sysid.selection.autoregression import Autoregression, fit_autoregression
@@ -34,9 +36,10 @@ from sysid.selection.frols import (
     rate_terms,
     select_forward,
     select_terms,
+    solve_coefficients,
 )
 from sysid.selection.regression import BLOCK_ROWS, find_lag_parameters, fold_rows
-from sysid.selection.starts import find_equation_error_starts
+from sysid.selection.starts import DIVERGENCE_LIMIT, find_equation_error_starts
 from sysid.simulation.problem import Problem
 
 MAX_SLOPES = 40_000_000
@@ -45,6 +48,9 @@ MAX_SLOPES = 40_000_000
 _MAX_ROUNDS = 6
 _BATCH_SIZE = 16  # simulations that a kernel runs in parallel
 _DIFFERENCE_STEP = 1e-6  # of a coefficient's range
+_MAX_SLOPE = 1e50  # more, and the free run diverges; its squares would overflow
+_TINY = float(np.finfo(float).tiny)
+_START_STEP = 1e-4  # of the output's deviation
 
 
 class FreeRunSelection(NamedTuple):
@@ -63,10 +69,10 @@ class FreeRunSelection(NamedTuple):
     samples : int
         Innovations of the noise.
     innovation_variance : float
-        Their mean square, that of n innovations times n^(p/n): the criterion of Bayes then pays
-        for the p coefficients of the noise.
+        Their mean square, times n^(p/n): so the criterion of Bayes pays for p coefficients of the
+        noise, of lags and of the start.
     noise_order : int
-        Order p of the autoregressive noise; 0: white.
+        Order of the autoregressive noise; 0: white.
     """
 
     forward_selection: ForwardSelection
@@ -110,40 +116,75 @@ class FreeRunSelector:
         self._tried: dict[frozenset[int], FreeRunSelection | None] = {}
 
     def select(self, starts: Sequence[Sequence[int]]) -> FreeRunSelection | None:
-        """Select from each of the starts by the plain error, then from the best by the whitened.
+        """Select from the starts by the plain error, then from the best by the whitened one.
 
-        None if no free run from there stays finite.
+        None if no free run from there stays finite. Once only white noise is left, no other start
+        is made.
         """
+        best: FreeRunSelection | None = None
         for start in starts:
-            self._iterate(start, is_white=True)
-        best = self._find_best()
+            if best is None or best.noise_order:
+                self._iterate(start, is_white=True)
+                best = self._find_best()
+        if best is not None:
+            self._iterate(self._reduce_order(best), is_white=True)
+            best = self._find_best()
         if best is not None and best.noise_order:
             self._iterate(best.forward_selection.order, is_white=False)
             best = self._find_best()
         if best is not None and self._demand is not self._rule:
             extended = extend_terms(best.triangle, best.forward_selection.order, self._rule.keep)
-            best = self.try_terms(extended) or best
+            fitted = self.try_terms(extended, best)
+            if fitted is not None:  # the terms besides are judged where they are not needed
+                best = best._replace(
+                    forward_selection=fitted.forward_selection,
+                    coefficients=fitted.coefficients,
+                    lags=fitted.lags,
+                )
         return best
 
-    def try_terms(self, chosen: Sequence[int]) -> FreeRunSelection | None:
-        """Fit the terms in a free run and linearise it there; None if it does not stay finite."""
+    def try_terms(
+        self, chosen: Sequence[int], near: FreeRunSelection | None = None
+    ) -> FreeRunSelection | None:
+        """Fit the terms in a free run and linearise it there; None if it does not stay finite.
+
+        The fit starts from the linear solution of the set `near`, if that stays finite.
+        """
         key = frozenset(chosen)
         if key not in self._tried:
-            values = _fit_free_run(self._whole, chosen)
+            values = _fit_free_run(self._whole, chosen, near)
             found = None if values is None else _linearise(self._whole, chosen, values)
             self._tried[key] = found
         return self._tried[key]
 
     def _iterate(self, chosen: Sequence[int], *, is_white: bool) -> None:
         """Select from the slopes at each fit, until that was tried before."""
+        tried: FreeRunSelection | None = None
         for round_number in range(_MAX_ROUNDS):
             if not chosen or (round_number and frozenset(chosen) in self._tried):
                 break
-            tried = self.try_terms(chosen)
+            tried = self.try_terms(chosen, tried)
             if tried is None:
                 break
             triangle = tried.plain_triangle if is_white else tried.triangle
             chosen = select_terms(triangle, self._demand, tried.samples).order
+
+    def _reduce_order(self, one: FreeRunSelection) -> list[int]:
+        """Replace the output's past value of the longest lag by those of shorter lags.
+
+        A model multiplied by a factor 1 + c/q has more terms and the same free run (Söderström,
+        Test of pole-zero cancellation, 1975). No removal of a single term leads back from there.
+        """
+        terms = self._whole.model.terms
+        lags = {
+            i: term.factors[0].offset
+            for i, term in enumerate(terms)
+            if len(term.factors) == 1 and term.factors[0].kind == "state"
+        }
+        chosen = list(one.forward_selection.order)
+        longest = max((lags[i] for i in chosen if i in lags), default=0)
+        kept = [i for i in chosen if lags.get(i) != longest]
+        return [*kept, *(i for i in lags if lags[i] < longest and i not in kept)]
 
     def _find_best(self) -> FreeRunSelection | None:
         found = [one for one in self._tried.values() if one is not None]
@@ -158,10 +199,12 @@ class FreeRunSelector:
 def _compute_output_power(problem: Problem) -> float:
     """Compute the mean square of the scored output."""
     squares = np.square(problem.evaluator.measured[problem.scored_rows])
-    return max(float(np.mean(squares)), np.finfo(float).tiny)
+    return max(float(np.mean(squares)), _TINY)
 
 
-def _fit_free_run(whole: Problem, chosen: Sequence[int]) -> dict[str, float] | None:
+def _fit_free_run(
+    whole: Problem, chosen: Sequence[int], near: FreeRunSelection | None
+) -> dict[str, float] | None:
     """Fit the chosen terms in a free run: values of all parameters, zero of the other terms."""
     model = whole.model
     names = {model.terms[i].coefficient_name for i in chosen}
@@ -176,19 +219,36 @@ def _fit_free_run(whole: Problem, chosen: Sequence[int]) -> dict[str, float] | N
         if parameter.name.startswith("a[") and parameter.name not in names
     }
     reduced = whole.rebuild(parameters={**whole.settings.parameters, **absent})
-    starts = find_equation_error_starts(reduced, GeneticAlgorithm()).values
-    if not starts:
+    theta = None if near is None else _refine(reduced, _solve_linear(model, chosen, near))
+    if theta is None:
+        starts = find_equation_error_starts(reduced, GeneticAlgorithm()).values
+        theta = _refine(reduced, starts[0]) if starts else None
+    if theta is None:
         return None
-    free = reduced.free_parameters
-    start = np.array([starts[0].get(p.name, 0.5 * (p.lower + p.upper)) for p in free])
-    refined = refine_candidates(reduced, [start])[0]
-    theta = start if refined is None else refined.theta
     fixed = {
         parameter.name: parameter.fixed
         for parameter in reduced.all_parameters
         if parameter.fixed is not None
     }
     return {**fixed, **dict(zip(reduced.free_names, theta.tolist(), strict=True))}
+
+
+def _solve_linear(model: Model, chosen: Sequence[int], near: FreeRunSelection) -> dict[str, float]:
+    """Solve the coefficients of some terms in the linear regression at another set."""
+    solution = solve_coefficients(near.plain_triangle, chosen).tolist()
+    return near.lags | {
+        term.coefficient_name: value for term, value in zip(model.terms, solution, strict=True)
+    }
+
+
+def _refine(problem: Problem, start: Mapping[str, float]) -> FloatArray | None:
+    """Refine a start (D,) inside the bounds; None if its free run does not stay finite."""
+    theta = [
+        min(max(start.get(p.name, 0.5 * (p.lower + p.upper)), p.lower), p.upper)
+        for p in problem.free_parameters
+    ]
+    (refined,) = refine_candidates(problem, [np.array(theta)])
+    return None if refined is None else refined.theta
 
 
 def _linearise(
@@ -199,45 +259,50 @@ def _linearise(
     terms, rows = whole.model.terms, whole.scored_rows
     simulated = whole.predict(theta[None])[0]
     residuals = (whole.evaluator.measured - simulated)[rows]
-    if not np.all(np.isfinite(residuals)):
+    if not np.all(np.abs(residuals) < DIVERGENCE_LIMIT * max(whole.output_scale, _TINY)):
         return None
     lags = sorted(find_lag_parameters(whole.model))
-    names = [name for name in lags if name in whole.free_names]
-    slopes = _compute_slopes(
-        whole, theta, simulated, [*names, *(term.coefficient_name for term in terms)]
-    )
+    slopes = _compute_slopes(whole, theta, simulated, [term.coefficient_name for term in terms])
     coefficients = np.array([values.get(term.coefficient_name, 0.0) for term in terms])
-    target = residuals + slopes[:, len(names) :] @ coefficients
-    columns = np.column_stack([slopes, target])
+    target = residuals + slopes @ coefficients
+    others = np.column_stack(
+        [_compute_slopes(whole, theta, simulated, lags), _compute_start_slopes(whole, theta)]
+    )
+    columns = np.column_stack([others, slopes, target])
     parts = _list_even_parts(whole)
     noise = fit_autoregression([residuals[part] for part in parts])
-
-    def fold(errors: Autoregression) -> FloatArray:
-        folded = np.zeros((0, columns.shape[1]))
-        for part in parts:
-            for block in errors.whiten(columns[part], BLOCK_ROWS):
-                folded = fold_rows(folded, block)
-        short = max(columns.shape[1] - folded.shape[0], 0)
-        return np.vstack([folded, np.zeros((short, folded.shape[1]))])[len(names) :, len(names) :]
-
-    triangle = fold(noise)
+    triangle, samples = _fold_whitened(columns, parts, noise, others.shape[1])
     selection = select_forward(triangle, len(chosen), among=chosen)
     if not selection.order:
         return None  # no term has an effect on the free run
-    innovations = np.concatenate(
-        [e for part in parts for e in noise.whiten(residuals[part], residuals.size)]
-    )
-    price = innovations.size ** (noise.order / innovations.size)
+    plain = triangle
+    if noise.order:
+        plain, _ = _fold_whitened(columns, parts, Autoregression(np.zeros(0)), others.shape[1])
+    squares = selection.unexplained_share * float(triangle[:, -1] @ triangle[:, -1])
+    price = samples ** ((noise.order + others.shape[1]) / samples)
     return FreeRunSelection(
         selection,
         coefficients,
         {name: values[name] for name in lags},
         triangle,
-        fold(Autoregression(np.zeros(0))) if noise.order else triangle,
-        innovations.size,
-        price * float(np.mean(np.square(innovations))),
+        plain,
+        samples,
+        price * squares / samples,
         noise.order,
     )
+
+
+def _fold_whitened(
+    columns: FloatArray, parts: Sequence[slice], noise: Autoregression, others: int
+) -> tuple[FloatArray, int]:
+    """Whiten and fold the columns, project out the first `others`, and count the rows."""
+    folded, rows = np.zeros((0, columns.shape[1])), 0
+    for part in parts:
+        for block in noise.whiten(columns[part], BLOCK_ROWS):
+            folded, rows = fold_rows(folded, block), rows + block.shape[0]
+    short = max(columns.shape[1] - folded.shape[0], 0)
+    folded = np.vstack([folded, np.zeros((short, folded.shape[1]))])
+    return folded[others:, others:], rows
 
 
 def _list_even_parts(problem: Problem) -> list[slice]:
@@ -272,5 +337,40 @@ def _compute_slopes(
             individuals[row, d] += steps[row]
         with np.errstate(over="ignore", invalid="ignore"):
             slope = (whole.predict(individuals) - simulated)[:, rows] / steps[:, None]
-        slopes[:, batch] = np.where(np.all(np.isfinite(slope), axis=1)[:, None], slope, 0.0).T
+        slopes[:, batch] = np.where(
+            np.all(np.abs(slope) < _MAX_SLOPE, axis=1)[:, None], slope, 0.0
+        ).T
     return slopes
+
+
+def _compute_start_slopes(whole: Problem, theta: FloatArray) -> FloatArray:
+    """Compute the slopes of the scored output (n, N) with respect to its measured start.
+
+    A recursion starts from measured samples, whose errors fade like a part of the response. Terms
+    that make up for them belong to no model.
+    """
+    slopes = []
+    for k in range(whole.model.memory):
+        pair = [
+            whole.replace_outputs([_move_sample(record, k, side) for record in whole.records])
+            for side in (-1.0, 1.0)
+        ]
+        low, high = (one.predict(theta[None])[0][whole.scored_rows] for one in pair)
+        slope = (high - low) / (2.0 * _START_STEP)
+        for part in iterate_parts(whole):
+            own = np.zeros(slope.size)
+            own[part.rows] = slope[part.rows]
+            if np.all(np.abs(own) < _MAX_SLOPE) and np.any(own):
+                slopes.append(own)
+    return np.array(slopes).reshape(-1, whole.n_scored).T
+
+
+def _move_sample(record: Record, k: int, side: float) -> Record:
+    """Move the k-th sample of each output by a small step of its deviation."""
+    outputs = []
+    for channel in record.outputs:
+        values = np.array(channel.values)
+        if k < values.size:
+            values[k] += side * _START_STEP * float(np.nanstd(values))
+        outputs.append(replace(channel, values=values))
+    return replace(record, outputs=tuple(outputs))

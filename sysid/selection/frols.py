@@ -176,16 +176,22 @@ def select_backward(triangle: FloatArray, order: Sequence[int]) -> dict[int, tup
     Removing term i increases the unexplained squares by aᵢ² / (G⁻¹)ᵢᵢ, with the inner products G of
     the terms.
     """
-    taken = list(order)
-    sets = {len(taken): tuple(taken)}
+    taken = tuple(order)
+    sets = {len(taken): taken}
     while len(taken) > 1:
-        basis, upper = np.linalg.qr(triangle[:, taken])
-        inverse = np.linalg.pinv(upper)
-        solution = inverse @ (basis.T @ triangle[:, -1])
-        spread = np.sum(np.square(inverse), axis=1)
-        taken.pop(int(np.argmin(np.square(solution) / np.where(spread > 0, spread, 1.0))))
-        sets[len(taken)] = tuple(taken)
+        taken = _remove_term(triangle, taken)
+        sets[len(taken)] = taken
     return sets
+
+
+def _remove_term(triangle: FloatArray, taken: tuple[int, ...]) -> tuple[int, ...]:
+    """Remove the least needed term."""
+    basis, upper = np.linalg.qr(triangle[:, list(taken)])
+    inverse = np.linalg.pinv(upper)
+    solution = inverse @ (basis.T @ triangle[:, -1])
+    spread = np.sum(np.square(inverse), axis=1)
+    least = int(np.argmin(np.square(solution) / np.where(spread > 0, spread, 1.0)))
+    return taken[:least] + taken[least + 1 :]
 
 
 def select_terms(triangle: FloatArray, rule: TermRule, samples: int) -> ForwardSelection:
@@ -247,7 +253,7 @@ def _leave_out_terms(
         return rate_terms(rule, share, len(terms), samples, candidates)
 
     while len(chosen) > 1:
-        fewer = exchange_terms(triangle, select_backward(triangle, chosen)[len(chosen) - 1])
+        fewer = exchange_terms(triangle, _remove_term(triangle, chosen))
         if rate(fewer) >= rate(chosen):
             break
         chosen = fewer

@@ -118,9 +118,19 @@ def _select_by_free_run(
     selector, order = FreeRunSelector(whole, rule), one_step.forward_selection.order
     if rule.error == "one-step":
         return selector.try_terms(order)
-    linear = [i for i, term in enumerate(whole.model.terms) if len(term.factors) <= 1]
-    straight = select_forward(one_step.triangle, rule.keep, among=linear).order
-    return selector.select([order, straight])
+    return selector.select([order, _choose_simple_terms(whole.model, one_step.triangle)])
+
+
+def _choose_simple_terms(model: Model, triangle: FloatArray) -> tuple[int, ...]:
+    """Choose one past value of the output, and all of the inputs.
+
+    Its dynamics are of first order, so no common factor of two polynomials can hide in them.
+    """
+    linear = [(i, term.factors[0]) for i, term in enumerate(model.terms) if len(term.factors) == 1]
+    outputs = [i for i, past in linear if past.kind == "state"]
+    inputs = [i for i, past in linear if past.kind != "state"]
+    first = select_forward(triangle, 1, among=outputs).order if outputs else ()
+    return (*first, *inputs)
 
 
 def _describe_selection(

@@ -5,10 +5,11 @@ A selection has errors of its own: a term that noise favoured looks as significa
 have another term instead, or that have one more (the neighbourhood of Madigan and York 1995), and
 sets two such steps away. The extended criterion of Bayes gives the weight of each, as in Bayesian
 model averaging (Hoeting et al. 1999). A term's probability is the weight of all sets that contain
-it. The variance of its coefficient between these sets adds to the one that a standard error tells.
+it. Sets that contain it may still give it another coefficient than its interval tells.
 """
 
 from collections.abc import Sequence
+from math import erf, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -18,34 +19,34 @@ from sysid.models.model import TermRule
 from sysid.selection.frols import compute_bic, select_terms
 
 CERTAIN = 20.0 / 21.0
-"""Probability of a term that belongs to the model: odds of 20 : 1, strong evidence (Kass and
-Raftery 1995)."""
+"""Weight of what is certain: odds of 20 : 1, strong evidence (Kass and Raftery 1995)."""
 
-MOST_MOVE = 1.0
-"""Largest deviation between selections, in standard errors: more, and most of the error is that of
-the selection."""
+LEAST_COVERAGE = 0.90
+"""Of a 95 % interval over all selections: less, and the selection errs oftener than the noise."""
 
+_LIMIT_95 = 1.96  # standard errors
 _EXPANDED = 8  # sets one step away from which a second step is made
-_MOST_RIVALS = 100  # that are weighed
+_MOST_RIVALS = 100  # sets of one size around another
+_LEAST_WEIGHT = 1e-4  # of a rival that may move a coefficient
 _TINY = float(np.finfo(float).tiny)
 _DEPENDENT_SHARE = 1e-12  # of a column's squares: less is rounding, the column is dependent
 
 
 class TermOdds(NamedTuple):
-    """Probability of a term, and the spread of its coefficient between selections.
+    """How certain a term and its coefficient are, by the selections that were compared.
 
     Attributes
     ----------
     probability : float
-        Weight of the selections with the term, of all that were compared.
-    move : float
-        Root mean square move of the coefficient between these, in standard errors.
+        Weight of the selections with the term.
+    coverage : float
+        Probability that the 95 % interval of its coefficient holds, over all selections.
     rival : str
-        The rival that counts most against the term, or else that moves it most; empty if none does.
+        The likeliest other selection: the change in words. Empty if both are certain.
     """
 
     probability: float
-    move: float
+    coverage: float
     rival: str
 
 
@@ -66,24 +67,36 @@ def weigh_terms(
     """
     own, errors = _solve(triangle, list(chosen), samples)
     sets = _collect_rivals(triangle, frozenset(chosen), samples)
-    rivals, weights = list(sets), np.array(list(sets.values()))
-    values = np.full((len(rivals), len(chosen)), np.nan)
-    for row, rival in enumerate(rivals):
-        solution = dict(
-            zip(order := sorted(rival), _solve(triangle, order, samples)[0], strict=True)
-        )
-        values[row] = [solution.get(i, np.nan) for i in chosen]
+    rivals = [rival for rival, weight in sets.items() if weight > _LEAST_WEIGHT]
+    solved = [_solve(triangle, list(rival), samples) for rival in rivals]
     found = []
     for i, term in enumerate(chosen):
-        is_absent = np.isnan(values[:, i])
-        probability = 1.0 - float(np.sum(weights[is_absent]))
-        moves = np.where(is_absent, 0.0, values[:, i] - own[i]) / max(errors[i], _TINY)
-        squared = weights * np.square(moves) / max(probability, _TINY)
-        deciding = weights * is_absent if probability < CERTAIN else squared
-        rival = rivals[int(np.argmax(deciding))]
-        text = _describe(rival, set(chosen), term, labels) if rival != set(chosen) else ""
-        found.append(TermOdds(probability, float(np.sqrt(np.sum(squared))), text))
+        probability = sum(weight for rival, weight in sets.items() if term in rival)
+        missed = np.zeros(len(rivals))  # weight of each times the share outside the interval
+        for row, (rival, (solution, deviations)) in enumerate(zip(rivals, solved, strict=True)):
+            if term in rival:
+                place = list(rival).index(term)
+                missed[row] = _compute_miss(own[i], errors[i], solution[place], deviations[place])
+            missed[row] = sets[rival] * (missed[row] if term in rival else 1.0)
+        lacking = np.array([sets[rival] * (term not in rival) for rival in rivals])
+        coverage = probability - float(np.sum(missed - lacking))
+        text = ""
+        if probability < CERTAIN:
+            text = _describe(rivals[int(np.argmax(lacking))], set(chosen), term, labels)
+        elif coverage < LEAST_COVERAGE:
+            others = [
+                0.0 if rival == set(chosen) else m for rival, m in zip(rivals, missed, strict=True)
+            ]
+            text = _describe(rivals[int(np.argmax(others))], set(chosen), term, labels)
+        found.append(TermOdds(probability, coverage, text))
     return found
+
+
+def _compute_miss(own: float, error: float, mean: float, deviation: float) -> float:
+    """Compute the share of a normal distribution outside the 95 % interval of the own value."""
+    scale = sqrt(2.0) * max(deviation, _TINY)
+    low, high = own - _LIMIT_95 * error, own + _LIMIT_95 * error
+    return 1.0 - 0.5 * (erf((high - mean) / scale) - erf((low - mean) / scale))
 
 
 def _solve(triangle: FloatArray, terms: list[int], samples: int) -> tuple[FloatArray, FloatArray]:
@@ -112,8 +125,8 @@ def _collect_rivals(
     """Collect the likeliest sets around the chosen one, with their weights, which sum to 1.
 
     The sets are those one step away from it or from the best set that is found, and one more step
-    from the best of them. A first step that
-    leaves a term out may lead through a poor set to a good one.
+    from the likeliest of them. A first step that leaves a term out may lead through a poor set to a
+    good one.
     """
     rule = TermRule(min(2 * len(chosen), triangle.shape[1] - 1), criterion="bic")
     best = frozenset(select_terms(triangle, rule, samples).order)
@@ -123,11 +136,9 @@ def _collect_rivals(
     for group in (smaller, others):
         for one in sorted(group, key=lambda one: (found[one], sorted(one)))[:_EXPANDED]:
             found |= _rate_neighbours(triangle, one, samples)
-    ranked = sorted(found, key=lambda one: (found[one], sorted(one)))
-    kept = [one for one in ranked[:_MOST_RIVALS] if one != chosen]
-    values = np.array([found[one] for one in (chosen, *kept)])
+    values = np.array(list(found.values()))
     weights = np.exp(-0.5 * (values - np.min(values)))
-    return dict(zip((chosen, *kept), (weights / np.sum(weights)).tolist(), strict=True))
+    return dict(zip(found, (weights / np.sum(weights)).tolist(), strict=True))
 
 
 def _rate_neighbours(
