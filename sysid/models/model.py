@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 from sysid.language.printer import format_expression
@@ -15,6 +16,12 @@ MAX_SUBSTEPS = 1000
 """Most integration steps in one grid step."""
 
 
+@lru_cache(maxsize=2048)
+def _write_product(factors: tuple[PastValue, ...]) -> str:
+    powers = Counter(format_expression(factor).replace(" ", "") for factor in factors)
+    return "*".join(f"{name}**{n}" if n > 1 else name for name, n in powers.items()) or "1"
+
+
 class Term(NamedTuple):
     """A product of past values; the empty product is the constant 1."""
 
@@ -23,10 +30,7 @@ class Term(NamedTuple):
     @property
     def label(self) -> str:
         """Text of the product, such as ``y(k-1)**2*u(k-1-dk)``."""
-        if not self.factors:
-            return "1"
-        powers = Counter(format_expression(factor).replace(" ", "") for factor in self.factors)
-        return "*".join(f"{name}**{n}" if n > 1 else name for name, n in powers.items())
+        return _write_product(self.factors)
 
     @property
     def coefficient_name(self) -> str:

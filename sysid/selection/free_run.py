@@ -50,7 +50,7 @@ _BATCH_SIZE = 16  # simulations that a kernel runs in parallel
 _DIFFERENCE_STEP = 1e-6  # of a coefficient's range
 _MAX_SLOPE = 1e50  # more, and the free run diverges; its squares would overflow
 _TINY = float(np.finfo(float).tiny)
-_START_STEP = 1e-4  # of the output's deviation
+_START_STEP = 1e-5  # of the output's deviation
 
 
 class FreeRunSelection(NamedTuple):
@@ -266,7 +266,10 @@ def _linearise(
     coefficients = np.array([values.get(term.coefficient_name, 0.0) for term in terms])
     target = residuals + slopes @ coefficients
     others = np.column_stack(
-        [_compute_slopes(whole, theta, simulated, lags), _compute_start_slopes(whole, theta)]
+        [
+            _compute_slopes(whole, theta, simulated, lags),
+            _compute_start_slopes(whole, theta, simulated),
+        ]
     )
     columns = np.column_stack([others, slopes, target])
     parts = _list_even_parts(whole)
@@ -343,7 +346,7 @@ def _compute_slopes(
     return slopes
 
 
-def _compute_start_slopes(whole: Problem, theta: FloatArray) -> FloatArray:
+def _compute_start_slopes(whole: Problem, theta: FloatArray, simulated: FloatArray) -> FloatArray:
     """Compute the slopes of the scored output (n, N) with respect to its measured start.
 
     A recursion starts from measured samples, whose errors fade like a part of the response. Terms
@@ -351,12 +354,8 @@ def _compute_start_slopes(whole: Problem, theta: FloatArray) -> FloatArray:
     """
     slopes = []
     for k in range(whole.model.memory):
-        pair = [
-            whole.replace_outputs([_move_sample(record, k, side) for record in whole.records])
-            for side in (-1.0, 1.0)
-        ]
-        low, high = (one.predict(theta[None])[0][whole.scored_rows] for one in pair)
-        slope = (high - low) / (2.0 * _START_STEP)
+        moved = whole.replace_outputs([_move_sample(record, k) for record in whole.records])
+        slope = (moved.predict(theta[None])[0] - simulated)[whole.scored_rows] / _START_STEP
         for part in iterate_parts(whole):
             own = np.zeros(slope.size)
             own[part.rows] = slope[part.rows]
@@ -365,12 +364,12 @@ def _compute_start_slopes(whole: Problem, theta: FloatArray) -> FloatArray:
     return np.array(slopes).reshape(-1, whole.n_scored).T
 
 
-def _move_sample(record: Record, k: int, side: float) -> Record:
+def _move_sample(record: Record, k: int) -> Record:
     """Move the k-th sample of each output by a small step of its deviation."""
     outputs = []
     for channel in record.outputs:
         values = np.array(channel.values)
         if k < values.size:
-            values[k] += side * _START_STEP * float(np.nanstd(values))
+            values[k] += _START_STEP * float(np.nanstd(values))
         outputs.append(replace(channel, values=values))
     return replace(record, outputs=tuple(outputs))

@@ -224,9 +224,10 @@ def extend_terms(triangle: FloatArray, chosen: Sequence[int], keep: int) -> tupl
 
 def _select_by_exchange(triangle: FloatArray, rule: TermRule, samples: int) -> tuple[int, ...]:
     """Select by a rule that compares numbers of terms."""
-    taken = select_forward(
-        triangle, min(2 * rule.keep + 2, max(rule.keep, _MAX_BACKWARD_TERMS))
-    ).order
+    forward = select_forward(triangle, min(2 * rule.keep + 2, max(rule.keep, _MAX_BACKWARD_TERMS)))
+    candidates = triangle.shape[1] - 1
+    wanted = _count_terms(forward.unexplained_shares, rule, samples, candidates)
+    taken = forward.order[: 2 * wanted + 2]
     backward_sets = select_backward(triangle, taken) if len(taken) <= _MAX_BACKWARD_TERMS else {}
     sets = [
         [taken[:k], backward_sets.get(k, taken[:k])]
@@ -234,7 +235,7 @@ def _select_by_exchange(triangle: FloatArray, rule: TermRule, samples: int) -> t
     ]
     whole = float(triangle[:, -1] @ triangle[:, -1])
     shares = [min(_compute_unexplained(triangle, terms) for terms in pair) / whole for pair in sets]
-    number = _count_terms(shares, rule, samples, triangle.shape[1] - 1)
+    number = _count_terms(shares, rule, samples, candidates)
     if number == 0:
         return ()
     exchanged = [exchange_terms(triangle, terms) for terms in sets[number - 1]]

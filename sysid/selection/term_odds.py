@@ -27,7 +27,7 @@ LEAST_COVERAGE = 0.90
 _LIMIT_95 = 1.96  # standard errors
 _EXPANDED = 8  # sets one step away from which a second step is made
 _MOST_RIVALS = 100  # sets of one size around another
-_LEAST_WEIGHT = 1e-4  # of a rival that may move a coefficient
+_LEAST_WEIGHT = 1e-3  # of a rival that may move a coefficient
 _TINY = float(np.finfo(float).tiny)
 _DEPENDENT_SHARE = 1e-12  # of a column's squares: less is rounding, the column is dependent
 
