@@ -140,6 +140,7 @@ class FreeRunSelector:
                     forward_selection=fitted.forward_selection,
                     coefficients=fitted.coefficients,
                     lags=fitted.lags,
+                    innovation_variance=fitted.innovation_variance,
                 )
         return best
 
@@ -179,12 +180,15 @@ class FreeRunSelector:
         lags = {
             i: term.factors[0].offset
             for i, term in enumerate(terms)
-            if len(term.factors) == 1 and term.factors[0].kind == "state"
+            if len(term.factors) == 1
+            and term.factors[0].kind == "state"
+            and term.factors[0].delay is None
         }
         chosen = list(one.forward_selection.order)
         longest = max((lags[i] for i in chosen if i in lags), default=0)
+        shorter = [i for i in lags if lags[i] < longest]
         kept = [i for i in chosen if lags.get(i) != longest]
-        return [*kept, *(i for i in lags if lags[i] < longest and i not in kept)]
+        return [*kept, *(i for i in shorter if i not in kept)] if shorter else chosen
 
     def _find_best(self) -> FreeRunSelection | None:
         found = [one for one in self._tried.values() if one is not None]

@@ -8,7 +8,7 @@ model averaging (Hoeting et al. 1999). A term's probability is the weight of all
 it. Sets that contain it may still give it another coefficient than its interval tells.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from math import erf, sqrt
 from typing import NamedTuple
 
@@ -65,48 +65,50 @@ def weigh_terms(
     labels : sequence of str
         Texts of the M candidates.
     """
-    own, errors = _solve(triangle, list(chosen), samples)
-    sets = _collect_rivals(triangle, frozenset(chosen), samples)
+    sets, taken = _collect_rivals(triangle, frozenset(chosen), samples), set(chosen)
+    own = _solve(triangle, taken, samples)
     rivals = [rival for rival, weight in sets.items() if weight > _LEAST_WEIGHT]
-    solved = [_solve(triangle, list(rival), samples) for rival in rivals]
+    solved = [_solve(triangle, rival, samples) for rival in rivals]
     found = []
-    for i, term in enumerate(chosen):
+    for term in chosen:
         probability = sum(weight for rival, weight in sets.items() if term in rival)
-        missed = np.zeros(len(rivals))  # weight of each times the share outside the interval
-        for row, (rival, (solution, deviations)) in enumerate(zip(rivals, solved, strict=True)):
-            if term in rival:
-                place = list(rival).index(term)
-                missed[row] = _compute_miss(own[i], errors[i], solution[place], deviations[place])
-            missed[row] = sets[rival] * (missed[row] if term in rival else 1.0)
-        lacking = np.array([sets[rival] * (term not in rival) for rival in rivals])
-        coverage = probability - float(np.sum(missed - lacking))
-        text = ""
-        if probability < CERTAIN:
-            text = _describe(rivals[int(np.argmax(lacking))], set(chosen), term, labels)
-        elif coverage < LEAST_COVERAGE:
-            others = [
-                0.0 if rival == set(chosen) else m for rival, m in zip(rivals, missed, strict=True)
-            ]
-            text = _describe(rivals[int(np.argmax(others))], set(chosen), term, labels)
+        missed = [  # the weight of each rival, times its share outside the interval
+            sets[rival] * (_compute_miss(own[term], solution[term]) if term in rival else 1.0)
+            for rival, solution in zip(rivals, solved, strict=True)
+        ]
+        coverage = 1.0 - sum(missed)
+        lacks_term = probability < CERTAIN
+        doubts = [
+            (miss, i)
+            for i, (rival, miss) in enumerate(zip(rivals, missed, strict=True))
+            if (term not in rival if lacks_term else rival != taken)
+        ]
+        is_open = doubts and (lacks_term or coverage < LEAST_COVERAGE)
+        rival = rivals[max(doubts)[1]] if is_open else None
+        text = "" if rival is None else _describe(rival, taken, term, labels)
         found.append(TermOdds(probability, coverage, text))
     return found
 
 
-def _compute_miss(own: float, error: float, mean: float, deviation: float) -> float:
-    """Compute the share of a normal distribution outside the 95 % interval of the own value."""
+def _compute_miss(own: tuple[float, float], other: tuple[float, float]) -> float:
+    """Compute the share of another estimate's distribution outside the own 95 % interval."""
+    (center, error), (mean, deviation) = own, other
     scale = sqrt(2.0) * max(deviation, _TINY)
-    low, high = own - _LIMIT_95 * error, own + _LIMIT_95 * error
+    low, high = center - _LIMIT_95 * error, center + _LIMIT_95 * error
     return 1.0 - 0.5 * (erf((high - mean) / scale) - erf((low - mean) / scale))
 
 
-def _solve(triangle: FloatArray, terms: list[int], samples: int) -> tuple[FloatArray, FloatArray]:
-    """Solve the coefficients of some terms, and their standard errors."""
-    matrix, target = triangle[:, terms], triangle[:, -1]
+def _solve(
+    triangle: FloatArray, terms: Collection[int], samples: int
+) -> dict[int, tuple[float, float]]:
+    """Solve the coefficients of some terms: each with its standard error."""
+    matrix, target = triangle[:, list(terms)], triangle[:, -1]
     inverse = np.linalg.pinv(matrix)
     solution = inverse @ target
     squares = float(np.sum(np.square(target - matrix @ solution)))
     variance = squares / max(samples - len(terms), 1)
-    return solution, np.sqrt(np.sum(np.square(inverse), axis=1) * variance)
+    errors = np.sqrt(np.sum(np.square(inverse), axis=1) * variance)
+    return dict(zip(terms, zip(solution.tolist(), errors.tolist(), strict=True), strict=True))
 
 
 def _describe(rival: frozenset[int], chosen: set[int], term: int, labels: Sequence[str]) -> str:
