@@ -1,0 +1,810 @@
+"""A yardstick: a linear black box, fitted in milliseconds and compared with the user's model.
+
+For every output, linear models of order 1 to 4 with a time lag for each input are fitted by their
+simulation error (output error, Ljung 1999, ch. 10). So noise at the output, however coloured, makes
+no bias. The inputs share the poles. Numerators, starts and an offset enter linearly and are
+projected out (Golub and Pereyra 1973); poles and time lags are moved by Levenberg–Marquardt. The
+starting points are the peaks of a scan: shapes of one or two poles by all time lags, by FFT.
+
+The order is the one whose left-out blocks are simulated best, by the formula of Allen's PRESS
+(Technometrics 16 (1974) 125) for blocks. For it each block is then really left out: poles and lags
+take a Gauss–Newton step without it, the linear part is fitted without it, and the whole record is
+simulated. The block is compared with that. The user's model is compared on the same samples, but it
+was fitted to them too. So it is at an advantage, and what is said against it is safe.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import exp, log
+from typing import NamedTuple
+
+import numpy as np
+from numpy.fft import irfft, rfft
+
+from sysid.core.types import BoolArray, FloatArray, IntArray
+from sysid.data.records import Channel, Record
+from sysid.residuals.autocorrelation import (
+    ROUNDING_SHARE,
+    pad_length,
+    smooth_spectrum_root,
+    space_residuals,
+)
+from sysid.simulation.fit_metrics import EXPLAINED_PERCENT, rms
+from sysid.simulation.problem import Problem
+
+ORDERS = (1, 2, 3, 4)
+"""Orders that are tried."""
+
+CLEAR_GAIN = 8.0
+"""Logarithm of the likelihood ratio from which on a yardstick is clearly better.
+
+Schwarz's penalty for one direction in 10,000 samples is 4.6, and odds of 20 : 1 are 3.0.
+"""
+
+NOTABLE_SHARE = 0.15
+"""Share of the mean square error of the user's model that a notable yardstick saves."""
+
+_BLOCKS = 10  # left out in turn, over all experiments
+_WARM_UP = 0.1  # of every experiment: it tells where the states start, and is not compared
+_MIN_SAMPLES = 40
+_ROWS = 500  # rows of a fit: a longer record is averaged, if its dynamics are slow enough
+_STEPS_PER_TIME_CONSTANT = 20.0  # of the averaged record
+_LONGEST_DELAY = 1.0 / 3.0  # of the record
+_SLOWEST = 100.0  # records: a longer time constant is an integrator
+_FASTEST = 3.0  # per step: a faster pole is a static gain
+_DAMPING = (0.005, 30.0)
+_SCANNED_DAMPING = (0.1, 0.4)
+_SHAPES_PER_DECADE = 4
+_EVALUATIONS = 14  # of the columns, for each order
+_CONVERGED = 1e-3  # relative decrease of the squares
+_WORTHWHILE = 0.99  # of the left-out squares: less is worth another order
+_DIFFERENCE = 1e-3  # of a logarithm, for slopes by differences
+_START_RIDGE = 1e-3  # noise over the prior deviation of a start, both in deviations of the output
+_RIDGE = 1e-7  # of a column, against rounding
+
+
+@dataclass(frozen=True, slots=True)
+class Yardstick:
+    """A linear model and the user's, compared on blocks that only the linear one did not see.
+
+    Attributes
+    ----------
+    output : str
+    order : int
+        Number of poles.
+    delays : mapping of str to float
+        Time lag (s) by input that moves.
+    samples : int
+        Samples that are compared.
+    fit_percent, own_fit_percent : float
+        Fit (%) of the linear model on left-out blocks, and of the user's on the same samples.
+    rms, own_rms : float
+        RMS error of both, in the unit of the output.
+    gain : float
+        Logarithm of the likelihood ratio of one direction: the residuals of the user's model along
+        the difference of both simulations, with the residuals' own colour.
+    """
+
+    output: str
+    order: int
+    delays: Mapping[str, float]
+    samples: int
+    fit_percent: float
+    own_fit_percent: float
+    rms: float
+    own_rms: float
+    gain: float
+
+    @property
+    def saved_share(self) -> float:
+        """Share of the user's mean square error that the linear model saves; negative: it adds."""
+        return 1.0 - (self.rms / self.own_rms) ** 2
+
+    @property
+    def is_clearly_better(self) -> bool:
+        """Whether the linear model is better beyond chance, and by a notable share."""
+        return self.gain > CLEAR_GAIN and self.saved_share > NOTABLE_SHARE
+
+
+def fit_yardstick(problem: Problem, simulated: FloatArray) -> Yardstick | None:
+    """Fit linear models to each output and compare the best with the user's model.
+
+    Every output is explained by all inputs. That of the largest gain is returned.
+
+    Parameters
+    ----------
+    problem : Problem
+    simulated : FloatArray, shape (M,)
+        Values that the user's model simulates at the measured times.
+
+    Returns
+    -------
+    Yardstick or None
+        None if no input moves, no output has 40 samples, or the user's model diverged or leaves
+        errors of the solver only.
+    """
+    tables = [_read_outputs(problem, simulated, name) for name in problem.output_weights]
+    compared = [_compare(problem.records, table) for table in tables if table is not None]
+    known = [yardstick for yardstick in compared if yardstick is not None]
+    return max(known, key=lambda one: (one.is_clearly_better, one.gain), default=None)
+
+
+class _Samples(NamedTuple):
+    """Scored samples (N,) of an output: experiment, time (s), measured and simulated value."""
+
+    output: str
+    experiment: IntArray
+    times: FloatArray
+    measured: FloatArray
+    simulated: FloatArray
+
+
+def _read_outputs(problem: Problem, simulated: FloatArray, name: str) -> _Samples | None:
+    """Read the scored samples of an output; None if they are too few or explained."""
+    parts = zip(
+        problem.records,
+        problem.split_by_output(problem.evaluator.measured),
+        problem.split_by_output(problem.evaluator.weight),
+        problem.split_by_output(simulated),
+        strict=True,
+    )
+    listed: list[tuple[FloatArray, ...]] = []
+    for number, (record, measured, weight, model) in enumerate(parts):
+        [times] = [channel.times for channel in record.outputs if channel.name == name]
+        scored = weight[name] > 0
+        columns = (np.full(times.size, float(number)), times, measured[name], model[name])
+        listed.append(tuple(column[scored] for column in columns))
+    experiment, times, measured, model = (np.concatenate(c) for c in zip(*listed, strict=True))
+    if times.size < _MIN_SAMPLES or not np.all(np.isfinite(model)):
+        return None
+    spread = float(np.std(measured))
+    if rms(measured - model) <= (1.0 - EXPLAINED_PERCENT / 100.0) * spread:
+        return None
+    return _Samples(name, experiment.astype(np.int64), times, measured, model)
+
+
+class _Rows(NamedTuple):
+    """Rows (R,) of a fit: experiment, position on the grid, centred value, root of the weight.
+
+    `block` is the block that a row is in, -1 where it is never left out.
+    """
+
+    experiment: IntArray
+    position: FloatArray
+    value: FloatArray
+    root: FloatArray
+    block: IntArray
+
+
+class _Grid(NamedTuple):
+    """Inputs on a regular grid, with their transforms.
+
+    Attributes
+    ----------
+    step : float
+        In s.
+    first : int
+        Grid point at which the records begin; the input is known before it.
+    inputs : FloatArray, shape (E, U, G)
+        Means over the step before a grid point, from their first value, of unit size.
+    spectra : FloatArray, shape (E, U, F)
+    length : int
+        Of the transforms: the double of G at least.
+    """
+
+    step: float
+    first: int
+    inputs: FloatArray
+    spectra: FloatArray
+    length: int
+
+    @property
+    def points(self) -> int:
+        """G: points of the grid."""
+        return self.inputs.shape[2]
+
+    @property
+    def longest_delay(self) -> int:
+        """Longest time lag that is tried, in steps."""
+        return max(int(_LONGEST_DELAY * (self.points - self.first)), 1)
+
+    @property
+    def slowest_rate(self) -> float:
+        """Rate of the slowest pole, per step."""
+        return 1.0 / (_SLOWEST * self.points)
+
+
+def _compare(records: Sequence[Record], samples: _Samples) -> Yardstick | None:
+    moving = _list_moving_inputs(records)
+    if not moving:
+        return None
+    starts = _find_starts(samples, len(records))
+    step = _choose_step(samples)
+    grid = _make_grid(records, moving, samples, starts, step)
+    blocks = _split_blocks(samples, len(records))
+    scale = float(np.std(samples.measured))
+    level = float(np.mean(samples.measured))
+    every = _Rows(
+        samples.experiment,
+        (samples.times - starts[samples.experiment]) / step + grid.first,
+        (samples.measured - level) / scale,
+        np.ones(samples.times.size),
+        blocks,
+    )
+    stride = _choose_stride(grid, every)
+    rows = every
+    if stride > 1:
+        rows = _average(every, stride)
+        coarse = _make_grid(records, moving, samples, starts, stride * step)
+        rows = rows._replace(
+            position=(rows.position - grid.first) / stride + coarse.first,
+        )
+        every = every._replace(position=(every.position - grid.first) / stride + coarse.first)
+        grid = coarse
+    fit = _choose_order(grid, rows)
+    if fit is None:
+        return None
+    predicted = level + scale * _simulate_left_out(grid, rows, fit, every)
+    return _assess(samples, predicted, blocks >= 0, moving, grid, fit)
+
+
+def _assess(
+    samples: _Samples,
+    predicted: FloatArray,
+    is_compared: BoolArray,
+    moving: Sequence[str],
+    grid: _Grid,
+    fit: "_Fit",
+) -> Yardstick:
+    """Compare both models on the left-out samples."""
+    experiments = samples.experiment[is_compared]
+    measured = samples.measured[is_compared]
+    own, other = samples.simulated[is_compared], predicted[is_compared]
+    size = np.sqrt(sum(_sum_centred(measured[experiments == e]) for e in np.unique(experiments)))
+    own_error, error = measured - own, measured - other
+    delays = {
+        name: max(float(delay) * grid.step, 0.0)
+        for name, delay in zip(moving, fit.delays, strict=True)
+    }
+    return Yardstick(
+        samples.output,
+        fit.shape.size,
+        delays,
+        int(measured.size),
+        100.0 * (1.0 - float(np.linalg.norm(error)) / size),
+        100.0 * (1.0 - float(np.linalg.norm(own_error)) / size),
+        rms(error),
+        rms(own_error),
+        _compute_gain(experiments, samples.times[is_compared], own_error, other - own),
+    )
+
+
+def _sum_centred(values: FloatArray) -> float:
+    return float(np.sum(np.square(values - np.mean(values))))
+
+
+def _compute_gain(
+    experiments: IntArray, times: FloatArray, errors: FloatArray, difference: FloatArray
+) -> float:
+    """Compute the gain of the difference of two simulations as an explanation of residuals.
+
+    If the user's model is true, its residuals are noise and know nothing of a simulation that did
+    not see them. So Σ e δ is normal with mean 0 (forecast encompassing: Chong and Hendry 1986;
+    Davidson and MacKinnon's J test, Econometrica 49 (1981) 781). Its variance comes from the
+    smoothed spectrum of what δ leaves of the residuals. The gain is half the square of Σ e δ over
+    its deviation, and 0 for a wrong sign.
+    """
+    power = float(difference @ difference)
+    if not power > 0:
+        return 0.0
+    total = float(errors @ difference)
+    left = errors - total / power * difference
+    variance = 0.0
+    for number in np.unique(experiments):
+        own = experiments == number
+        noise = space_residuals(times[own], left[own])
+        moved = space_residuals(times[own], difference[own])
+        root = smooth_spectrum_root(noise.values, noise.present)
+        part = rfft(moved.values, 2 * (root.size - 1)) * root
+        variance += float(np.sum(np.square(np.abs(part))))
+    return 0.5 * max(total, 0.0) ** 2 / variance if variance > 0 else 0.0
+
+
+def _list_moving_inputs(records: Sequence[Record]) -> list[str]:
+    """List the inputs that move in some record."""
+    names = dict.fromkeys(channel.name for record in records for channel in record.inputs)
+    return [
+        name
+        for name in names
+        if any(
+            np.ptp(values) > ROUNDING_SHARE * np.max(np.abs(values))
+            for record in records
+            for channel in record.inputs
+            if channel.name == name
+            for values in [channel.history_and_samples.values]
+        )
+    ]
+
+
+def _find_starts(samples: _Samples, experiments: int) -> FloatArray:
+    """Find the first time (s) of every experiment, 0 where it has no sample."""
+    starts = np.zeros(experiments)
+    for number in np.unique(samples.experiment):
+        starts[number] = samples.times[samples.experiment == number][0]
+    return starts
+
+
+def _choose_step(samples: _Samples) -> float:
+    """Choose the step (s) of the grid: the sampling period, longer if most samples are missing."""
+    steps = np.diff(samples.times)[np.diff(samples.experiment) == 0]
+    steps = steps[steps > 0]
+    if not steps.size:
+        return 1.0
+    return max(float(np.median(steps)), float(np.sum(steps)) / (2 * samples.times.size))
+
+
+def _make_grid(
+    records: Sequence[Record],
+    moving: Sequence[str],
+    samples: _Samples,
+    starts: FloatArray,
+    step: float,
+) -> _Grid:
+    """Place the inputs on a grid that begins, for each experiment, at its first sample."""
+    ends = np.array(
+        [np.max(samples.times[samples.experiment == e], initial=0.0) for e in range(len(records))]
+    )
+    spans = np.maximum(ends - starts, 0.0)
+    points = int(np.ceil(np.max(spans) / step)) + 3
+    before = max(start - _find_first_time(r) for start, r in zip(starts, records, strict=True))
+    first = int(np.clip(before / step, 0.0, _LONGEST_DELAY * points))
+    inputs = np.zeros((len(records), len(moving), first + points))
+    for number, record in enumerate(records):
+        edges = starts[number] + step * (np.arange(first + points + 1.0) - first - 1.0)
+        for channel in record.inputs:
+            if channel.name in moving:
+                inputs[number, moving.index(channel.name)] = _average_input(channel, edges)
+    inputs -= inputs[:, :, :1]
+    sizes = np.sqrt(np.mean(np.square(inputs), axis=(0, 2), keepdims=True))
+    inputs /= np.where(sizes > 0, sizes, 1.0)
+    length = pad_length(2 * (first + points))
+    return _Grid(step, first, inputs, rfft(inputs, length, axis=2), length)
+
+
+def _find_first_time(record: Record) -> float:
+    return min(
+        (channel.history_and_samples.times[0] for channel in record.inputs), default=record.start
+    )
+
+
+def _average_input(channel: Channel, edges: FloatArray) -> FloatArray:
+    """Average an input between the edges (G + 1,); its ends are held outside the record."""
+    whole = channel.history_and_samples
+    known = np.isfinite(whole.values)
+    times, values = whole.times[known], whole.values[known]
+    gaps = np.diff(times)
+    is_held = channel.effective_hold == "zero"
+    heights = values[:-1] if is_held else 0.5 * (values[1:] + values[:-1])
+    knots = np.concatenate([[0.0], np.cumsum(heights * gaps)])
+    inside = np.clip(edges, times[0], times[-1])
+    index = np.clip(np.searchsorted(times, inside, side="right") - 1, 0, max(times.size - 2, 0))
+    since = inside - times[index]
+    heights = values[index]
+    if not is_held and times.size > 1:
+        slopes = np.diff(values) / np.where(gaps > 0, gaps, 1.0)
+        heights = heights + 0.5 * slopes[index] * since
+    integral = knots[index] + heights * since
+    integral += values[0] * np.minimum(edges - times[0], 0.0)
+    integral += values[-1] * np.maximum(edges - times[-1], 0.0)
+    return np.asarray(np.diff(integral) / np.diff(edges))
+
+
+def _split_blocks(samples: _Samples, experiments: int) -> IntArray:
+    """Number the blocks of the samples (N,) by time; -1 for the first part of an experiment."""
+    blocks = np.full(samples.times.size, -1, dtype=np.int64)
+    each, count = max(round(_BLOCKS / experiments), 1), 0
+    for number in np.unique(samples.experiment):
+        own = np.flatnonzero(samples.experiment == number)
+        later = own[int(np.ceil(_WARM_UP * own.size)) :]
+        for part in np.array_split(later, each):
+            blocks[part] = count
+            count += 1
+    return blocks
+
+
+def _average(rows: _Rows, stride: int) -> _Rows:
+    """Average rows in groups of neighbours of one experiment and block."""
+    key = rows.experiment * (np.max(rows.block) + 2) + rows.block + 1
+    changes = np.concatenate([[True], np.diff(key) != 0])
+    firsts = np.flatnonzero(changes)
+    since = np.arange(key.size) - np.repeat(firsts, np.diff(np.append(firsts, key.size)))
+    begins = np.flatnonzero(changes | (since % stride == 0))
+    counts = np.diff(np.append(begins, key.size))
+    return _Rows(
+        rows.experiment[begins],
+        np.add.reduceat(rows.position, begins) / counts,
+        np.add.reduceat(rows.value, begins) / counts,
+        np.sqrt(counts),
+        rows.block[begins],
+    )
+
+
+def _discretise(shapes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Build the matrices (B, n, n) and input vectors (B, n) of chains of sections.
+
+    Shapes (B, n) hold the logarithms of rate and damping for every section of second order, and at
+    last that of the rate for one of first order. Every section has gain 1. Rates are per step. The
+    state of a section is its value and its slope over the rate, so that slow ones are well scaled.
+    """
+    count, order = shapes.shape
+    matrix = np.zeros((count, order, order))
+    at_rest = np.zeros((count, order))
+    for k in range(0, order, 2):
+        rate = np.exp(shapes[:, k])
+        drive = at_rest_index = k
+        if k + 1 < order:
+            matrix[:, k, k + 1] = rate
+            matrix[:, k + 1, k] = -rate
+            matrix[:, k + 1, k + 1] = -2.0 * np.exp(shapes[:, k + 1]) * rate
+            drive = k + 1
+        else:
+            matrix[:, k, k] = -rate
+        if k:
+            matrix[:, drive, k - 2] = rate
+        at_rest[:, at_rest_index] = 1.0
+    scaled, unit = matrix / 256.0, np.eye(order)
+    power = unit + scaled / 5.0
+    for divisor in (4.0, 3.0, 2.0, 1.0):
+        power = unit + (scaled @ power) / divisor
+    for _ in range(8):
+        power = power @ power
+    return power, at_rest - np.einsum("bij,bj->bi", power, at_rest)
+
+
+def _compute_impulses(shapes: FloatArray, points: int) -> FloatArray:
+    """Compute the impulse responses (B, n, G) of the states, by doubling."""
+    power, drive = _discretise(shapes)
+    impulses = drive[:, :, None]
+    while impulses.shape[2] < points:
+        impulses = np.concatenate([impulses, power @ impulses], axis=2)
+        power = power @ power
+    return impulses[:, :, :points]
+
+
+class _Signals(NamedTuple):
+    """Signals on the grid: responses (B, U, n, E, G), free ones (B, n, G), to a step (B, G)."""
+
+    responses: FloatArray
+    free: FloatArray
+    step: FloatArray
+
+
+def _respond(grid: _Grid, shapes: FloatArray) -> _Signals:
+    """Simulate the states of shapes (B, n) for every input, from rest."""
+    impulses = _compute_impulses(shapes, grid.points)
+    transform = rfft(impulses, grid.length, axis=2)
+    product = transform[:, None, :, None, :] * grid.spectra.transpose(1, 0, 2)[None, :, None]
+    responses = irfft(product, grid.length, axis=4)[..., : grid.points]
+    last = (shapes.shape[1] - 1) // 2 * 2  # the value of the last section
+    return _Signals(responses, impulses, np.cumsum(impulses[:, last], axis=1))
+
+
+def _read(
+    grid: _Grid, signals: _Signals, delays: FloatArray, rows: _Rows
+) -> tuple[FloatArray, FloatArray]:
+    """Read the columns (B, P, R) of rows, and the slopes (B, U, n, R) of responses over a delay.
+
+    `delays` (B, U) are in steps; between grid points responses are read in straight lines.
+    """
+    count, channels, order, experiments, points = signals.responses.shape
+    position = rows.position - delays[:, :, None]
+    index = np.clip(np.floor(position).astype(np.int64), 0, points - 2)
+    share = np.clip(position - index, 0.0, 1.0)[:, :, None]
+    flat = signals.responses.reshape(count, channels, order, experiments * points)
+    place = (index + rows.experiment * points)[:, :, None]
+    low = np.take_along_axis(flat, place, axis=3)
+    slope = np.take_along_axis(flat, place + 1, axis=3) - low
+    driven = (low + share * slope).reshape(count, channels * order, -1)
+    since = rows.position - grid.first
+    index = np.clip(np.floor(since).astype(np.int64), 0, points - 2)
+    share = since - index
+    free = (1.0 - share) * signals.free[:, :, index] + share * signals.free[:, :, index + 1]
+    free /= np.maximum(np.max(np.abs(signals.free), axis=2), 1e-300)[:, :, None]
+    is_own = rows.experiment == np.arange(experiments)[:, None]
+    starts = (free[:, None] * is_own[None, :, None]).reshape(count, experiments * order, -1)
+    offset = (1.0 - share) * signals.step[:, index] + share * signals.step[:, index + 1]
+    columns = np.concatenate([driven, starts, offset[:, None]], axis=1)
+    return columns, slope * (position >= 0)[:, :, None]
+
+
+def _make_ridge(columns: FloatArray, channels: int) -> FloatArray:
+    """Make the ridge (B, P) of linear coefficients: starts are of the size of the output."""
+    count = columns.shape[1]
+    power = np.einsum("bpr,bpr->bp", columns, columns)
+    ridge = _RIDGE**2 * power + 1e-200
+    ridge[:, channels : count - 1] += _START_RIDGE**2
+    return ridge
+
+
+def _solve(gram: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve symmetric systems (…, P, P) for right sides (…, P), scaled to a unit diagonal."""
+    size = np.sqrt(np.maximum(np.einsum("...pp->...p", gram), 1e-300))
+    scaled = gram / (size[..., :, None] * size[..., None, :])
+    scaled = scaled + 1e-13 * np.eye(gram.shape[-1])
+    return np.asarray(np.linalg.solve(scaled, (right / size)[..., None])[..., 0] / size)
+
+
+class _Fit(NamedTuple):
+    """A fitted shape (n,), its delays (U,) in steps, and what a step from there needs.
+
+    `columns` (R, P) are the slopes over linear coefficients, shape and delays, times the roots of
+    the weights; `ridge` (P,) is theirs; `errors` (R,) are weighted too.
+    """
+
+    shape: FloatArray
+    delays: FloatArray
+    squares: float
+    columns: FloatArray
+    ridge: FloatArray
+    errors: FloatArray
+
+
+def _linearise(grid: _Grid, rows: _Rows, shape: FloatArray, delays: FloatArray) -> _Fit:
+    """Fit the linear coefficients and compute the slopes over all parameters."""
+    order, channels = shape.size, delays.size
+    moved = np.vstack([shape, shape + _DIFFERENCE * np.eye(order)])
+    signals = _respond(grid, moved)
+    columns, slopes = _read(grid, signals, np.tile(delays, (order + 1, 1)), rows)
+    columns *= rows.root
+    ridge = _make_ridge(columns[:1], channels * order)[0]
+    gram = columns[0] @ columns[0].T
+    gram[np.diag_indices_from(gram)] += ridge
+    value = rows.root * rows.value
+    linear = _solve(gram, columns[0] @ value)
+    outputs = np.einsum("p,bpr->br", linear, columns)
+    by_shape = (outputs[1:] - outputs[0]) / _DIFFERENCE
+    coefficients = linear[: channels * order].reshape(channels, order)
+    by_delay = -np.einsum("un,unr->ur", coefficients, slopes[0]) * rows.root
+    errors = value - outputs[0]
+    squares = float(errors @ errors + ridge @ np.square(linear))
+    whole = np.vstack([columns[0], by_shape, by_delay]).T
+    tiny = _RIDGE**2 * np.einsum("rp,rp->p", whole[:, linear.size :], whole[:, linear.size :])
+    return _Fit(shape, delays, squares, whole, np.concatenate([ridge, tiny + 1e-200]), errors)
+
+
+def _clip_shape(grid: _Grid, shape: FloatArray) -> FloatArray:
+    clipped = shape.copy()
+    for k in range(0, shape.size, 2):
+        clipped[k] = np.clip(shape[k], log(grid.slowest_rate), log(_FASTEST))
+        if k + 1 < shape.size:
+            largest = min(_DAMPING[1], _FASTEST / exp(clipped[k]))
+            clipped[k + 1] = np.clip(shape[k + 1], log(_DAMPING[0]), log(max(largest, 0.5)))
+    return clipped
+
+
+def _minimise(grid: _Grid, rows: _Rows, shape: FloatArray, delays: FloatArray) -> _Fit:
+    """Minimise the squares over shape and delays (Levenberg 1944, Marquardt 1963)."""
+    fit = _linearise(grid, rows, _clip_shape(grid, shape), delays)
+    damping = 1e-2
+    for _ in range(_EVALUATIONS):
+        gram = fit.columns.T @ fit.columns
+        count = shape.size + delays.size
+        extra = fit.ridge.copy()
+        extra[-count:] += damping * gram.diagonal()[-count:]
+        gram[np.diag_indices_from(gram)] += extra
+        move = np.clip(_solve(gram, fit.columns.T @ fit.errors)[-count:], -3.0, 3.0)
+        trial = _linearise(grid, rows, *_move(grid, fit, move))
+        if trial.squares < fit.squares:
+            is_done = trial.squares > (1.0 - _CONVERGED) * fit.squares
+            fit, damping = trial, 0.1 * damping
+            if is_done:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e3:
+                break
+    return fit
+
+
+def _move(grid: _Grid, fit: _Fit, move: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Move shape and delays, within their bounds; logarithms move by 1 at most."""
+    shape = _clip_shape(grid, fit.shape + np.clip(move[: fit.shape.size], -1.0, 1.0))
+    delays = np.clip(fit.delays + move[fit.shape.size :], -1.0, float(grid.longest_delay))
+    return shape, delays
+
+
+class _Peak(NamedTuple):
+    """Best shape (n,) of a scan for one input, its delay in steps, and the squares it explains."""
+
+    shape: FloatArray
+    delay: int
+    explained: float
+    response: FloatArray
+
+
+def _list_rates(grid: _Grid) -> FloatArray:
+    """List the rates of a scan, per step: from the whole record to a step."""
+    count = int(np.ceil(_SHAPES_PER_DECADE * np.log10(grid.points))) + 1
+    return np.geomspace(1.0 / grid.points, 1.0, count)
+
+
+def _spread(grid: _Grid, rows: _Rows, values: FloatArray) -> FloatArray:
+    """Add weighted values (R,) up on the grid, (E, G)."""
+    experiments, _, points = grid.inputs.shape
+    place = np.rint(rows.position).astype(np.int64) + rows.experiment * points
+    total = np.bincount(place, rows.root**2 * values, experiments * points)
+    return np.asarray(total.reshape(experiments, points))
+
+
+def _scan(grid: _Grid, channel: int, target: FloatArray, shapes: FloatArray) -> _Peak:
+    """Find the shape (of S, n) and the delay that explain a target (E, G) best, n = 1 or 2."""
+    transform = rfft(_compute_impulses(shapes, grid.points), grid.length, axis=2)
+    spectra = transform[:, :, None, :] * grid.spectra[None, None, :, channel]
+    responses = irfft(spectra, grid.length, axis=3)[..., : grid.points]
+    crossed = np.sum(np.conj(spectra) * rfft(target, grid.length, axis=1), axis=2)
+    count = grid.longest_delay + 1
+    sums = irfft(crossed, grid.length, axis=2)[..., :count]
+    ends = grid.points - 1 - np.arange(count)
+    means = np.cumsum(responses.sum(axis=2), axis=2)[..., ends]
+    pairs = np.einsum("saeg,sbeg->sabg", responses, responses)
+    grams = np.cumsum(pairs, axis=3)[..., ends]
+    total = grid.points * grid.inputs.shape[0]
+    grams = grams - means[:, :, None] * means[:, None] / total
+    grams = np.moveaxis(grams, 3, 1) + 1e-9 * total * np.eye(shapes.shape[1])
+    sums = np.moveaxis(sums, 2, 1)
+    if shapes.shape[1] == 1:
+        coefficients = sums / grams[..., 0]
+    else:
+        determinant = grams[..., 0, 0] * grams[..., 1, 1] - grams[..., 0, 1] ** 2
+        first = grams[..., 1, 1] * sums[..., 0] - grams[..., 0, 1] * sums[..., 1]
+        second = grams[..., 0, 0] * sums[..., 1] - grams[..., 0, 1] * sums[..., 0]
+        coefficients = np.stack([first, second], axis=2) / determinant[..., None]
+    explained = np.sum(coefficients * sums, axis=2)
+    s, delay = np.unravel_index(int(np.argmax(explained)), explained.shape)
+    response = np.zeros_like(target)
+    summed = np.einsum("a,aeg->eg", coefficients[s, delay], responses[s])
+    response[:, delay:] = summed[:, : grid.points - delay]
+    return _Peak(shapes[s], int(delay), float(explained[s, delay]), response)
+
+
+def _scan_inputs(grid: _Grid, rows: _Rows, shapes: FloatArray) -> list[_Peak]:
+    """Scan the inputs one after the other, each for what the others leave (backfitting)."""
+    target, weight = _spread(grid, rows, rows.value), _spread(grid, rows, np.ones(rows.value.size))
+    channels = grid.inputs.shape[1]
+    peaks: dict[int, _Peak] = {}
+    for _ in range(1 if channels == 1 else 2):
+        for channel in range(channels):
+            left = target - sum(
+                weight * (peak.response - np.mean(peak.response))
+                for other, peak in peaks.items()
+                if other != channel
+            )
+            peaks[channel] = _scan(grid, channel, left, shapes)
+    return [peaks[channel] for channel in range(channels)]
+
+
+def _choose_stride(grid: _Grid, rows: _Rows) -> int:
+    """Choose how many samples are averaged: as many as slow dynamics and a long record allow."""
+    most = rows.value.size // _ROWS
+    if most < 2:
+        return 1
+    rates = np.geomspace(1.0 / grid.points, 1.0, 8)
+    peaks = _scan_inputs(grid, rows, np.log(rates)[:, None])
+    fastest = max(exp(peak.shape[0]) for peak in peaks)
+    return int(np.clip(1.0 / (_STEPS_PER_TIME_CONSTANT * fastest), 1, most))
+
+
+def _choose_order(grid: _Grid, rows: _Rows) -> _Fit | None:
+    """Fit each order and choose the one that simulates left-out blocks best."""
+    rates = np.log(_list_rates(grid))
+    real = _scan_inputs(grid, rows, rates[:, None])
+    pairs = [(rate, log(damping)) for rate in rates for damping in _SCANNED_DAMPING]
+    resonant = _scan_inputs(grid, rows, np.array(pairs))
+    best: _Fit | None = None
+    least, previous = np.inf, None
+    for order in ORDERS:
+        free_parameters = (order + 1) * (grid.inputs.shape[0] + grid.inputs.shape[1]) + order
+        if 5 * free_parameters > rows.value.size:
+            break
+        starts = _list_starts(grid, order, real, resonant, previous)
+        fits = [_minimise(grid, rows, *start) for start in _select_starts(grid, rows, starts)]
+        previous = min(fits, key=lambda fit: fit.squares)
+        squares = _sum_left_out(previous, rows.block)
+        if squares < _WORTHWHILE * least:
+            least, best = squares, previous
+    return best
+
+
+_Start = tuple[FloatArray, FloatArray]
+
+
+def _list_starts(
+    grid: _Grid,
+    order: int,
+    real: Sequence[_Peak],
+    resonant: Sequence[_Peak],
+    previous: _Fit | None,
+) -> list[_Start]:
+    """List starting points of an order: peaks of the scans, and one order less with a new pole."""
+    if previous is None:
+        delays = np.array([float(peak.delay) for peak in real])
+        return [(peak.shape, delays) for peak in real]
+    starts = list[_Start]()
+    fast = np.array([float(peak.delay) for peak in resonant])
+    rates = np.log(np.geomspace(2.0 / grid.points, 1.0, 5))
+    if order == 2:
+        starts = [(peak.shape, fast) for peak in resonant]
+    if order == 4:
+        starts = [(np.concatenate([previous.shape[:2], peak.shape]), fast) for peak in resonant]
+    for rate in rates:
+        if order % 2:
+            starts.append((np.append(previous.shape, rate), previous.delays))
+        else:
+            slow, quick = sorted((float(previous.shape[-1]), float(rate)))
+            middle = 0.5 * (slow + quick)
+            damping = np.cosh(0.5 * (quick - slow))
+            pair = [middle, log(damping)]
+            starts.append((np.append(previous.shape[:-1], pair), previous.delays))
+    return starts
+
+
+def _select_starts(grid: _Grid, rows: _Rows, starts: Sequence[_Start]) -> list[_Start]:
+    """Select the starting point with the least squares, after a fit of the linear part."""
+    if len(starts) == 1:
+        return list(starts)
+    shapes = np.array([_clip_shape(grid, shape) for shape, _ in starts])
+    delays = np.array([delay for _, delay in starts])
+    columns, _ = _read(grid, _respond(grid, shapes), delays, rows)
+    columns *= rows.root
+    gram = columns @ columns.transpose(0, 2, 1)
+    ridge = _make_ridge(columns, shapes.shape[1] * delays.shape[1])
+    diagonal = np.arange(gram.shape[1])
+    gram[:, diagonal, diagonal] += ridge
+    right = columns @ (rows.root * rows.value)
+    explained = np.einsum("bp,bp->b", right, _solve(gram, right))
+    return [starts[int(np.argmax(explained))]]
+
+
+def _leave_out(fit: _Fit, blocks: IntArray) -> tuple[list[BoolArray], FloatArray]:
+    """Compute the moves (B, P) of all parameters when each block is left out."""
+    masks = [blocks == number for number in range(int(np.max(blocks)) + 1)]
+    gram = fit.columns.T @ fit.columns
+    gram[np.diag_indices_from(gram)] += fit.ridge
+    parts = np.array([fit.columns[mask].T @ fit.columns[mask] for mask in masks])
+    right = np.array([fit.columns[mask].T @ fit.errors[mask] for mask in masks])
+    return masks, -_solve(gram - parts, right)
+
+
+def _sum_left_out(fit: _Fit, blocks: IntArray) -> float:
+    """Sum the squared errors of left-out blocks, linear in all parameters."""
+    masks, moves = _leave_out(fit, blocks)
+    return sum(
+        float(np.sum(np.square(fit.errors[mask] - fit.columns[mask] @ move)))
+        for mask, move in zip(masks, moves, strict=True)
+    )
+
+
+def _simulate_left_out(grid: _Grid, rows: _Rows, fit: _Fit, every: _Rows) -> FloatArray:
+    """Simulate each block of all samples with parameters fitted without it; 0 elsewhere."""
+    masks, moves = _leave_out(fit, rows.block)
+    count = fit.shape.size + fit.delays.size
+    moved = [_move(grid, fit, move[-count:]) for move in moves]
+    shapes = np.array([shape for shape, _ in moved])
+    delays = np.array([delay for _, delay in moved])
+    signals = _respond(grid, shapes)
+    columns, _ = _read(grid, signals, delays, rows)
+    columns *= rows.root
+    ridge = _make_ridge(columns, fit.shape.size * fit.delays.size)
+    value = rows.root * rows.value
+    predicted = np.zeros(every.value.size)
+    for number, mask in enumerate(masks):
+        seen = columns[number][:, ~mask]
+        gram = seen @ seen.T
+        gram[np.diag_indices_from(gram)] += ridge[number]
+        linear = _solve(gram, seen @ value[~mask])
+        own = every.block == number
+        part = _Rows(*(column[own] for column in every))
+        one = _Signals(*(signal[number : number + 1] for signal in signals))
+        read, _ = _read(grid, one, delays[number : number + 1], part)
+        predicted[own] = linear @ read[0]
+    return predicted
