@@ -47,14 +47,17 @@ NOTABLE_SHARE = 0.15
 _BLOCKS = 10  # left out in turn, over all experiments
 _WARM_UP = 0.1  # of every experiment: it tells where the states start, and is not compared
 _MIN_SAMPLES = 40
+_LEAST_SHARE = 0.5  # of the samples must be compared
 _ROWS = 500  # rows of a fit: a longer record is averaged, if its dynamics are slow enough
 _STEPS_PER_TIME_CONSTANT = 20.0  # of the averaged record
 _LONGEST_DELAY = 1.0 / 3.0  # of the record
 _SLOWEST = 100.0  # records: a longer time constant is an integrator
+_SLOW_SHARE = 1.0 / 3.0  # of the record: only one time constant may be longer
 _FASTEST = 3.0  # per step: a faster pole is a static gain
 _DAMPING = (0.005, 30.0)
-_SCANNED_DAMPING = (0.1, 0.4)
+_SCANNED_DAMPING = (0.1, 0.4, 1.2)
 _SHAPES_PER_DECADE = 4
+_SCANNED_DELAYS = (1.0, 0.7, 0.3, 0.0)  # of the delays of one order less
 _EVALUATIONS = 14  # of the columns, for each order
 _CONVERGED = 1e-3  # relative decrease of the squares
 _WORTHWHILE = 0.99  # of the left-out squares: less is worth another order
@@ -245,7 +248,10 @@ def _compare(records: Sequence[Record], samples: _Samples) -> Yardstick | None:
     if fit is None:
         return None
     predicted = level + scale * _simulate_left_out(grid, rows, fit, every)
-    return _assess(samples, predicted, blocks >= 0, moving, grid, fit)
+    is_compared = np.isfinite(predicted)
+    if np.count_nonzero(is_compared) < _LEAST_SHARE * samples.times.size:
+        return None
+    return _assess(samples, predicted, is_compared, moving, grid, fit)
 
 
 def _assess(
@@ -275,7 +281,7 @@ def _assess(
         100.0 * (1.0 - float(np.linalg.norm(own_error)) / size),
         rms(error),
         rms(own_error),
-        _compute_gain(experiments, samples.times[is_compared], own_error, other - own),
+        _compute_gain(experiments, samples.times[is_compared], own_error, error),
     )
 
 
@@ -284,30 +290,26 @@ def _sum_centred(values: FloatArray) -> float:
 
 
 def _compute_gain(
-    experiments: IntArray, times: FloatArray, errors: FloatArray, difference: FloatArray
+    experiments: IntArray, times: FloatArray, own_errors: FloatArray, errors: FloatArray
 ) -> float:
-    """Compute the gain of the difference of two simulations as an explanation of residuals.
+    """Compute the logarithm of the likelihood ratio, from as many samples as are independent.
 
-    If the user's model is true, its residuals are noise and know nothing of a simulation that did
-    not see them. So Σ e δ is normal with mean 0 (forecast encompassing: Chong and Hendry 1986;
-    Davidson and MacKinnon's J test, Econometrica 49 (1981) 781). Its variance comes from the
-    smoothed spectrum of what δ leaves of the residuals. The gain is half the square of Σ e δ over
-    its deviation, and 0 for a wrong sign.
+    For Gaussian noise of unknown size it is ν/2 times the logarithm of the ratio of both mean
+    squares, without a penalty, because the samples were left out. As the residuals of the user's
+    model have a colour, ν is the number of white samples whose variance is as uncertain: n / Σ ρ²
+    (Bayley and Hammersley, J. R. Statist. Soc. Suppl. 8 (1946) 184), here with the sum over all
+    lags ρ by the periodogram. That counts a misfit as colour, so it is too small rather than too
+    large.
     """
-    power = float(difference @ difference)
-    if not power > 0:
-        return 0.0
-    total = float(errors @ difference)
-    left = errors - total / power * difference
-    variance = 0.0
+    square = fourth = 0.0
     for number in np.unique(experiments):
         own = experiments == number
-        noise = space_residuals(times[own], left[own])
-        moved = space_residuals(times[own], difference[own])
-        root = smooth_spectrum_root(noise.values, noise.present)
-        part = rfft(moved.values, 2 * (root.size - 1)) * root
-        variance += float(np.sum(np.square(np.abs(part))))
-    return 0.5 * max(total, 0.0) ** 2 / variance if variance > 0 else 0.0
+        spaced = space_residuals(times[own], own_errors[own])
+        power = np.square(np.abs(rfft(spaced.values)))
+        square += float(np.sum(power))
+        fourth += float(np.sum(np.square(power)))
+    independent = min(4.0 * square**2 / fourth, float(errors.size)) if fourth > 0 else 0.0
+    return 0.5 * independent * log(rms(own_errors) ** 2 / rms(errors) ** 2)
 
 
 def _list_moving_inputs(records: Sequence[Record]) -> list[str]:
@@ -573,12 +575,24 @@ def _linearise(grid: _Grid, rows: _Rows, shape: FloatArray, delays: FloatArray) 
 
 
 def _clip_shape(grid: _Grid, shape: FloatArray) -> FloatArray:
-    clipped = shape.copy()
+    """Keep poles stable and slower than the samples, and all but one faster than the record.
+
+    One pole may integrate. With more of them a response to a step is a polynomial in time, which
+    follows drifts of coloured noise.
+    """
+    clipped, slow = shape.copy(), 1.0 / (_SLOW_SHARE * (grid.points - grid.first))
     for k in range(0, shape.size, 2):
-        clipped[k] = np.clip(shape[k], log(grid.slowest_rate), log(_FASTEST))
-        if k + 1 < shape.size:
-            largest = min(_DAMPING[1], _FASTEST / exp(clipped[k]))
-            clipped[k + 1] = np.clip(shape[k + 1], log(_DAMPING[0]), log(max(largest, 0.5)))
+        is_last = k + 2 >= shape.size
+        slowest = grid.slowest_rate if is_last else slow
+        if k + 1 == shape.size:
+            clipped[k] = np.clip(shape[k], log(slowest), log(_FASTEST))
+            continue
+        # The poles are at about `ratio` times the rate, and at the rate over it.
+        damping = float(np.clip(exp(shape[k + 1]), *_DAMPING))
+        ratio = max(2.0 * damping, 1.0)
+        least, most = max(slowest * ratio, slow / ratio), _FASTEST / ratio
+        clipped[k] = log(np.clip(exp(shape[k]), least, max(most, least)))
+        clipped[k + 1] = log(damping)
     return clipped
 
 
@@ -738,13 +752,12 @@ def _list_starts(
         starts = [(np.concatenate([previous.shape[:2], peak.shape]), fast) for peak in resonant]
     for rate in rates:
         if order % 2:
-            starts.append((np.append(previous.shape, rate), previous.delays))
+            shape = np.append(previous.shape, rate)
         else:
             slow, quick = sorted((float(previous.shape[-1]), float(rate)))
-            middle = 0.5 * (slow + quick)
-            damping = np.cosh(0.5 * (quick - slow))
-            pair = [middle, log(damping)]
-            starts.append((np.append(previous.shape[:-1], pair), previous.delays))
+            pair = [0.5 * (slow + quick), log(np.cosh(0.5 * (quick - slow)))]
+            shape = np.append(previous.shape[:-1], pair)
+        starts += [(shape, share * previous.delays) for share in _SCANNED_DELAYS]
     return starts
 
 
@@ -765,30 +778,60 @@ def _select_starts(grid: _Grid, rows: _Rows, starts: Sequence[_Start]) -> list[_
     return [starts[int(np.argmax(explained))]]
 
 
-def _leave_out(fit: _Fit, blocks: IntArray) -> tuple[list[BoolArray], FloatArray]:
-    """Compute the moves (B, P) of all parameters when each block is left out."""
+class _LeftOut(NamedTuple):
+    """A block left out: its rows (R,), the moves (P,) of all parameters, and whether it is told.
+
+    `is_told`: the other blocks determine what is simulated in it.
+    """
+
+    mask: BoolArray
+    move: FloatArray
+    is_told: bool
+
+
+def _leave_out(fit: _Fit, blocks: IntArray) -> list[_LeftOut]:
+    """Leave out each block, by a Gauss–Newton step.
+
+    The mean variance of what is then simulated in it, over that of the noise, is the trace of
+    J (A - JᵀJ)⁻¹ Jᵀ by its rows, where A is the sum of all products. Up to 1 the block is told.
+    """
     masks = [blocks == number for number in range(int(np.max(blocks)) + 1)]
     gram = fit.columns.T @ fit.columns
     gram[np.diag_indices_from(gram)] += fit.ridge
     parts = np.array([fit.columns[mask].T @ fit.columns[mask] for mask in masks])
     right = np.array([fit.columns[mask].T @ fit.errors[mask] for mask in masks])
-    return masks, -_solve(gram - parts, right)
+    others = gram - parts
+    size = np.sqrt(np.maximum(np.einsum("bpp->bp", others), 1e-300))
+    scaled = others / (size[:, :, None] * size[:, None, :])
+    inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True)
+    moves = -np.einsum("bpq,bq->bp", inverse, right / size) / size
+    products = parts / (size[:, :, None] * size[:, None, :])
+    variances = np.einsum("bpq,bqp->b", inverse, products)
+    return [
+        _LeftOut(mask, move, bool(variance <= np.count_nonzero(mask)))
+        for mask, move, variance in zip(masks, moves, variances, strict=True)
+    ]
 
 
 def _sum_left_out(fit: _Fit, blocks: IntArray) -> float:
-    """Sum the squared errors of left-out blocks, linear in all parameters."""
-    masks, moves = _leave_out(fit, blocks)
-    return sum(
-        float(np.sum(np.square(fit.errors[mask] - fit.columns[mask] @ move)))
-        for mask, move in zip(masks, moves, strict=True)
-    )
+    """Sum the squared errors of left-out blocks, linear in all parameters.
+
+    A block that the others do not tell counts as the variance of its values says.
+    """
+    total = 0.0
+    for mask, move, is_told in _leave_out(fit, blocks):
+        if is_told:
+            total += float(np.sum(np.square(fit.errors[mask] - fit.columns[mask] @ move)))
+        else:
+            total += float(np.count_nonzero(mask))
+    return total
 
 
 def _simulate_left_out(grid: _Grid, rows: _Rows, fit: _Fit, every: _Rows) -> FloatArray:
-    """Simulate each block of all samples with parameters fitted without it; 0 elsewhere."""
-    masks, moves = _leave_out(fit, rows.block)
+    """Simulate each block of all samples with parameters fitted without it; nan elsewhere."""
+    left_out = _leave_out(fit, rows.block)
     count = fit.shape.size + fit.delays.size
-    moved = [_move(grid, fit, move[-count:]) for move in moves]
+    moved = [_move(grid, fit, one.move[-count:]) for one in left_out]
     shapes = np.array([shape for shape, _ in moved])
     delays = np.array([delay for _, delay in moved])
     signals = _respond(grid, shapes)
@@ -796,15 +839,17 @@ def _simulate_left_out(grid: _Grid, rows: _Rows, fit: _Fit, every: _Rows) -> Flo
     columns *= rows.root
     ridge = _make_ridge(columns, fit.shape.size * fit.delays.size)
     value = rows.root * rows.value
-    predicted = np.zeros(every.value.size)
-    for number, mask in enumerate(masks):
-        seen = columns[number][:, ~mask]
+    predicted = np.full(every.value.size, np.nan)
+    for number, one in enumerate(left_out):
+        if not one.is_told:
+            continue
+        seen = columns[number][:, ~one.mask]
         gram = seen @ seen.T
         gram[np.diag_indices_from(gram)] += ridge[number]
-        linear = _solve(gram, seen @ value[~mask])
+        linear = _solve(gram, seen @ value[~one.mask])
         own = every.block == number
         part = _Rows(*(column[own] for column in every))
-        one = _Signals(*(signal[number : number + 1] for signal in signals))
-        read, _ = _read(grid, one, delays[number : number + 1], part)
+        single = _Signals(*(signal[number : number + 1] for signal in signals))
+        read, _ = _read(grid, single, delays[number : number + 1], part)
         predicted[own] = linear @ read[0]
     return predicted
