@@ -26,7 +26,6 @@ from sysid.data.records import Channel, Record
 from sysid.residuals.autocorrelation import (
     ROUNDING_SHARE,
     pad_length,
-    smooth_spectrum_root,
     space_residuals,
 )
 from sysid.simulation.fit_metrics import EXPLAINED_PERCENT, rms
@@ -61,6 +60,7 @@ _SCANNED_DELAYS = (1.0, 0.7, 0.3, 0.0)  # of the delays of one order less
 _EVALUATIONS = 14  # of the columns, for each order
 _CONVERGED = 1e-3  # relative decrease of the squares
 _WORTHWHILE = 0.99  # of the left-out squares: less is worth another order
+_STEP_SHARES = (1.0, 0.5, 0.2)  # of a step without a block, until it lowers the squares
 _DIFFERENCE = 1e-3  # of a logarithm, for slopes by differences
 _START_RIDGE = 1e-3  # noise over the prior deviation of a start, both in deviations of the output
 _RIDGE = 1e-7  # of a column, against rounding
@@ -715,7 +715,7 @@ def _choose_order(grid: _Grid, rows: _Rows) -> _Fit | None:
     pairs = [(rate, log(damping)) for rate in rates for damping in _SCANNED_DAMPING]
     resonant = _scan_inputs(grid, rows, np.array(pairs))
     best: _Fit | None = None
-    least, previous = np.inf, None
+    least, previous = np.full(int(np.max(rows.block)) + 1, np.inf), None
     for order in ORDERS:
         free_parameters = (order + 1) * (grid.inputs.shape[0] + grid.inputs.shape[1]) + order
         if 5 * free_parameters > rows.value.size:
@@ -724,7 +724,10 @@ def _choose_order(grid: _Grid, rows: _Rows) -> _Fit | None:
         fits = [_minimise(grid, rows, *start) for start in _select_starts(grid, rows, starts)]
         previous = min(fits, key=lambda fit: fit.squares)
         squares = _sum_left_out(previous, rows.block)
-        if squares < _WORTHWHILE * least:
+        known = np.isfinite(squares) & ~np.isnan(least)
+        if np.mean(known) < _LEAST_SHARE:
+            continue
+        if np.sum(squares[known]) < _WORTHWHILE * np.sum(least[known]):
             least, best = squares, previous
     return best
 
@@ -813,43 +816,60 @@ def _leave_out(fit: _Fit, blocks: IntArray) -> list[_LeftOut]:
     ]
 
 
-def _sum_left_out(fit: _Fit, blocks: IntArray) -> float:
-    """Sum the squared errors of left-out blocks, linear in all parameters.
+def _sum_left_out(fit: _Fit, blocks: IntArray) -> FloatArray:
+    """Sum the squared errors of each left-out block (B,), linear in all parameters.
 
-    A block that the others do not tell counts as the variance of its values says.
+    It is nan for a block that the others do not tell.
     """
-    total = 0.0
-    for mask, move, is_told in _leave_out(fit, blocks):
-        if is_told:
-            total += float(np.sum(np.square(fit.errors[mask] - fit.columns[mask] @ move)))
-        else:
-            total += float(np.count_nonzero(mask))
-    return total
+    return np.array(
+        [
+            float(np.sum(np.square(fit.errors[mask] - fit.columns[mask] @ move)))
+            if is_told
+            else np.nan
+            for mask, move, is_told in _leave_out(fit, blocks)
+        ]
+    )
 
 
 def _simulate_left_out(grid: _Grid, rows: _Rows, fit: _Fit, every: _Rows) -> FloatArray:
     """Simulate each block of all samples with parameters fitted without it; nan elsewhere."""
-    left_out = _leave_out(fit, rows.block)
-    count = fit.shape.size + fit.delays.size
-    moved = [_move(grid, fit, one.move[-count:]) for one in left_out]
-    shapes = np.array([shape for shape, _ in moved])
-    delays = np.array([delay for _, delay in moved])
-    signals = _respond(grid, shapes)
-    columns, _ = _read(grid, signals, delays, rows)
-    columns *= rows.root
-    ridge = _make_ridge(columns, fit.shape.size * fit.delays.size)
-    value = rows.root * rows.value
     predicted = np.full(every.value.size, np.nan)
-    for number, one in enumerate(left_out):
-        if not one.is_told:
-            continue
-        seen = columns[number][:, ~one.mask]
-        gram = seen @ seen.T
-        gram[np.diag_indices_from(gram)] += ridge[number]
-        linear = _solve(gram, seen @ value[~one.mask])
-        own = every.block == number
-        part = _Rows(*(column[own] for column in every))
-        single = _Signals(*(signal[number : number + 1] for signal in signals))
-        read, _ = _read(grid, single, delays[number : number + 1], part)
-        predicted[own] = linear @ read[0]
+    left_out = _leave_out(fit, rows.block)
+    waiting = [number for number, block in enumerate(left_out) if block.is_told]
+    count = fit.shape.size + fit.delays.size
+    for share in _STEP_SHARES:
+        moved = [_move(grid, fit, share * left_out[number].move[-count:]) for number in waiting]
+        if not moved:
+            break
+        shapes = np.array([shape for shape, _ in moved])
+        delays = np.array([delay for _, delay in moved])
+        signals = _respond(grid, shapes)
+        columns, _ = _read(grid, signals, delays, rows)
+        columns *= rows.root
+        ridge = _make_ridge(columns, fit.shape.size * fit.delays.size)
+        rejected = []
+        for i, number in enumerate(waiting):
+            seen = ~left_out[number].mask
+            linear, squares = _fit_linear(columns[i][:, seen], ridge[i], rows, seen)
+            before = float(np.sum(np.square(fit.errors[seen])))
+            if squares > before and share != _STEP_SHARES[-1]:
+                rejected.append(number)
+                continue
+            own = every.block == number
+            part = _Rows(*(column[own] for column in every))
+            single = _Signals(*(signal[i : i + 1] for signal in signals))
+            read, _ = _read(grid, single, delays[i : i + 1], part)
+            predicted[own] = linear @ read[0]
+        waiting = rejected
     return predicted
+
+
+def _fit_linear(
+    columns: FloatArray, ridge: FloatArray, rows: _Rows, seen: BoolArray
+) -> tuple[FloatArray, float]:
+    """Fit the linear coefficients to some rows; return their squares too."""
+    value = (rows.root * rows.value)[seen]
+    gram = columns @ columns.T
+    gram[np.diag_indices_from(gram)] += ridge
+    linear = _solve(gram, columns @ value)
+    return linear, float(np.sum(np.square(value - linear @ columns)))
