@@ -48,14 +48,16 @@ _WARM_UP = 0.1  # of every experiment: it tells where the states start, and is n
 _MIN_SAMPLES = 40
 _LEAST_SHARE = 0.5  # of the samples must be compared
 _ROWS = 500  # rows of a fit: a longer record is averaged, if its dynamics are slow enough
-_STEPS_PER_TIME_CONSTANT = 20.0  # of the averaged record
+_STEPS_PER_TIME_CONSTANT = 12.0  # of the averaged record
 _LONGEST_DELAY = 1.0 / 3.0  # of the record
 _SLOWEST = 100.0  # records: a longer time constant is an integrator
 _SLOW_SHARE = 1.0 / 3.0  # of the record: only one time constant may be longer
 _FASTEST = 3.0  # per step: a faster pole is a static gain
 _DAMPING = (0.005, 30.0)
 _SCANNED_DAMPING = (0.1, 0.4, 1.2)
-_SHAPES_PER_DECADE = 4
+_SHAPES_PER_DECADE = 3
+_NEW_POLES = 5  # rates at which a new pole is tried
+_START_ROWS = 200  # by which starts are compared
 _SCANNED_DELAYS = (1.0, 0.7, 0.3, 0.0)  # of the delays of one order less
 _EVALUATIONS = 14  # of the columns, for each order
 _CONVERGED = 1e-3  # relative decrease of the squares
@@ -474,49 +476,81 @@ def _compute_impulses(shapes: FloatArray, points: int) -> FloatArray:
 
 
 class _Signals(NamedTuple):
-    """Signals on the grid: responses (B, U, n, E, G), free ones (B, n, G), to a step (B, G)."""
+    """Signals of B shapes on the grid.
+
+    Responses to every input (B, U, n, E · G), free responses (B, n, G), response to a step (B, G).
+    """
 
     responses: FloatArray
     free: FloatArray
     step: FloatArray
 
-
-def _respond(grid: _Grid, shapes: FloatArray) -> _Signals:
-    """Simulate the states of shapes (B, n) for every input, from rest."""
-    impulses = _compute_impulses(shapes, grid.points)
-    transform = rfft(impulses, grid.length, axis=2)
-    product = transform[:, None, :, None, :] * grid.spectra.transpose(1, 0, 2)[None, :, None]
-    responses = irfft(product, grid.length, axis=4)[..., : grid.points]
-    last = (shapes.shape[1] - 1) // 2 * 2  # the value of the last section
-    return _Signals(responses, impulses, np.cumsum(impulses[:, last], axis=1))
+    def select(self, number: int) -> "_Signals":
+        """Select those of one shape."""
+        return _Signals(*(signal[number : number + 1] for signal in self))
 
 
-def _read(
-    grid: _Grid, signals: _Signals, delays: FloatArray, rows: _Rows
-) -> tuple[FloatArray, FloatArray]:
-    """Read the columns (B, P, R) of rows, and the slopes (B, U, n, R) of responses over a delay.
+def _respond(grid: _Grid, impulses: FloatArray) -> _Signals:
+    """Simulate the states of impulse responses (B, n, G) for every input, from rest."""
+    count, order, _ = impulses.shape
+    responses = _convolve(grid, np.repeat(impulses[:, None], grid.inputs.shape[1], axis=1))
+    last = (order - 1) // 2 * 2  # the value of the last section
+    return _Signals(
+        responses.reshape(count, grid.inputs.shape[1], order, -1),
+        impulses / np.maximum(np.max(np.abs(impulses), axis=2, keepdims=True), 1e-300),
+        np.cumsum(impulses[:, last], axis=1),
+    )
 
-    `delays` (B, U) are in steps; between grid points responses are read in straight lines.
-    """
-    count, channels, order, experiments, points = signals.responses.shape
-    position = rows.position - delays[:, :, None]
+
+def _convolve(grid: _Grid, impulses: FloatArray) -> FloatArray:
+    """Convolve impulse responses (B, U, n, G) with the inputs, (B, U, n, E, G)."""
+    transform = rfft(impulses, grid.length, axis=3)[:, :, :, None]
+    inputs = grid.spectra.transpose(1, 0, 2)[None, :, None]
+    return irfft(transform * inputs, grid.length, axis=4)[..., : grid.points]
+
+
+class _Places(NamedTuple):
+    """Places of rows (R,) on the grid, and the share of the next point: straight lines."""
+
+    index: IntArray
+    share: FloatArray
+
+    def read(self, signals: FloatArray) -> FloatArray:
+        """Read signals (…, G) at the places, (…, R)."""
+        low = np.take(signals, self.index, axis=-1)
+        return np.asarray(low + self.share * self.slope(signals, low))
+
+    def slope(self, signals: FloatArray, low: FloatArray) -> FloatArray:
+        """Compute the slopes of signals (…, G) behind the places, (…, R)."""
+        return np.asarray(np.take(signals, self.index + 1, axis=-1) - low)
+
+
+def _locate(position: FloatArray, points: int, offset: IntArray | int = 0) -> _Places:
     index = np.clip(np.floor(position).astype(np.int64), 0, points - 2)
-    share = np.clip(position - index, 0.0, 1.0)[:, :, None]
-    flat = signals.responses.reshape(count, channels, order, experiments * points)
-    place = (index + rows.experiment * points)[:, :, None]
-    low = np.take_along_axis(flat, place, axis=3)
-    slope = np.take_along_axis(flat, place + 1, axis=3) - low
-    driven = (low + share * slope).reshape(count, channels * order, -1)
-    since = rows.position - grid.first
-    index = np.clip(np.floor(since).astype(np.int64), 0, points - 2)
-    share = since - index
-    free = (1.0 - share) * signals.free[:, :, index] + share * signals.free[:, :, index + 1]
-    free /= np.maximum(np.max(np.abs(signals.free), axis=2), 1e-300)[:, :, None]
-    is_own = rows.experiment == np.arange(experiments)[:, None]
-    starts = (free[:, None] * is_own[None, :, None]).reshape(count, experiments * order, -1)
-    offset = (1.0 - share) * signals.step[:, index] + share * signals.step[:, index + 1]
-    columns = np.concatenate([driven, starts, offset[:, None]], axis=1)
-    return columns, slope * (position >= 0)[:, :, None]
+    return _Places(index + offset, np.clip(position - index, 0.0, 1.0))
+
+
+def _locate_delayed(grid: _Grid, delays: FloatArray, rows: _Rows) -> list[_Places]:
+    """Locate rows on the joined grids of the experiments, for each input."""
+    offset = rows.experiment * grid.points
+    return [_locate(rows.position - delay, grid.points, offset) for delay in delays]
+
+
+def _read(grid: _Grid, signals: _Signals, delays: FloatArray, rows: _Rows) -> FloatArray:
+    """Read the columns (B, P, R) of rows for delays (U,) in steps, times the roots of weights."""
+    count, _, order, _ = signals.responses.shape
+    driven = [
+        places.read(signals.responses[:, u])
+        for u, places in enumerate(_locate_delayed(grid, delays, rows))
+    ]
+    since = _locate(rows.position - grid.first, grid.points)
+    free, experiments = since.read(signals.free), grid.inputs.shape[0]
+    if experiments > 1:
+        is_own = rows.experiment == np.arange(experiments)[:, None]
+        free = (free[:, None] * is_own[None, :, None]).reshape(count, experiments * order, -1)
+    columns = np.concatenate([*driven, free, since.read(signals.step)[:, None]], axis=1)
+    columns *= rows.root
+    return np.asarray(columns)
 
 
 def _make_ridge(columns: FloatArray, channels: int) -> FloatArray:
@@ -555,21 +589,31 @@ def _linearise(grid: _Grid, rows: _Rows, shape: FloatArray, delays: FloatArray) 
     """Fit the linear coefficients and compute the slopes over all parameters."""
     order, channels = shape.size, delays.size
     moved = np.vstack([shape, shape + _DIFFERENCE * np.eye(order)])
-    signals = _respond(grid, moved)
-    columns, slopes = _read(grid, signals, np.tile(delays, (order + 1, 1)), rows)
-    columns *= rows.root
-    ridge = _make_ridge(columns[:1], channels * order)[0]
-    gram = columns[0] @ columns[0].T
+    impulses = _compute_impulses(moved, grid.points)
+    signals = _respond(grid, impulses[:1])
+    [columns] = _read(grid, signals, delays, rows)
+    [ridge] = _make_ridge(columns[None], channels * order)
+    gram = columns @ columns.T
     gram[np.diag_indices_from(gram)] += ridge
     value = rows.root * rows.value
-    linear = _solve(gram, columns[0] @ value)
-    outputs = np.einsum("p,bpr->br", linear, columns)
-    by_shape = (outputs[1:] - outputs[0]) / _DIFFERENCE
-    coefficients = linear[: channels * order].reshape(channels, order)
-    by_delay = -np.einsum("un,unr->ur", coefficients, slopes[0]) * rows.root
-    errors = value - outputs[0]
+    linear = _solve(gram, columns @ value)
+    errors = value - linear @ columns
     squares = float(errors @ errors + ridge @ np.square(linear))
-    whole = np.vstack([columns[0], by_shape, by_delay]).T
+    # The perturbed states are summed before they meet the inputs: one convolution for each input.
+    change = (impulses[1:] - impulses[0]) / _DIFFERENCE
+    driven = linear[: channels * order].reshape(channels, order)
+    starts = linear[channels * order : -1].reshape(-1, order)
+    starts = starts / np.maximum(np.max(np.abs(impulses[0]), axis=1), 1e-300)
+    responses = _convolve(grid, (driven @ change)[:, :, None]).reshape(order, channels, -1)
+    last = (order - 1) // 2 * 2
+    free = starts @ change + linear[-1] * np.cumsum(change[:, last], axis=1)[:, None]
+    since = _locate(rows.position - grid.first, grid.points, rows.experiment * grid.points)
+    by_shape, by_delay = since.read(free.reshape(order, -1)), np.empty((channels, value.size))
+    for u, places in enumerate(_locate_delayed(grid, delays, rows)):
+        by_shape += places.read(responses[:, u])
+        summed = driven[u] @ signals.responses[0, u]
+        by_delay[u] = -places.slope(summed, summed[places.index])
+    whole = np.vstack([columns, rows.root * by_shape, rows.root * by_delay]).T
     tiny = _RIDGE**2 * np.einsum("rp,rp->p", whole[:, linear.size :], whole[:, linear.size :])
     return _Fit(shape, delays, squares, whole, np.concatenate([ridge, tiny + 1e-200]), errors)
 
@@ -721,8 +765,7 @@ def _choose_order(grid: _Grid, rows: _Rows) -> _Fit | None:
         if 5 * free_parameters > rows.value.size:
             break
         starts = _list_starts(grid, order, real, resonant, previous)
-        fits = [_minimise(grid, rows, *start) for start in _select_starts(grid, rows, starts)]
-        previous = min(fits, key=lambda fit: fit.squares)
+        previous = _minimise(grid, rows, *_select_start(grid, rows, starts))
         squares = _sum_left_out(previous, rows)
         known = np.isfinite(squares) & ~np.isnan(least)
         if np.mean(known) < _LEAST_SHARE:
@@ -742,43 +785,47 @@ def _list_starts(
     resonant: Sequence[_Peak],
     previous: _Fit | None,
 ) -> list[_Start]:
-    """List starting points of an order: peaks of the scans, and one order less with a new pole."""
+    """List starting shapes (S, n) with their delays: peaks, and one order less with a new pole."""
+    peaks = real if previous is None else resonant
+    delays = np.array([float(peak.delay) for peak in peaks])
+    shapes = np.array([peak.shape for peak in peaks])
     if previous is None:
-        delays = np.array([float(peak.delay) for peak in real])
-        return [(peak.shape, delays) for peak in real]
+        return [(shapes, delays)]
     starts = list[_Start]()
-    fast = np.array([float(peak.delay) for peak in resonant])
-    rates = np.log(np.geomspace(2.0 / grid.points, 1.0, 5))
-    if order == 2:
-        starts = [(peak.shape, fast) for peak in resonant]
-    if order == 4:
-        starts = [(np.concatenate([previous.shape[:2], peak.shape]), fast) for peak in resonant]
-    for rate in rates:
-        if order % 2:
-            shape = np.append(previous.shape, rate)
-        else:
-            slow, quick = sorted((float(previous.shape[-1]), float(rate)))
-            pair = [0.5 * (slow + quick), log(np.cosh(0.5 * (quick - slow)))]
-            shape = np.append(previous.shape[:-1], pair)
-        starts += [(shape, share * previous.delays) for share in _SCANNED_DELAYS]
+    if order % 2 == 0:
+        rest = np.tile(previous.shape[:-1], (len(peaks), 1))
+        starts.append((np.hstack([rest, shapes]), delays))
+    rates = np.log(np.geomspace(2.0 / grid.points, 1.0, _NEW_POLES))
+    if order % 2:
+        shapes = np.column_stack([np.tile(previous.shape, (rates.size, 1)), rates])
+    else:
+        half = 0.5 * (rates - previous.shape[-1])
+        pairs = np.column_stack([0.5 * (rates + previous.shape[-1]), np.log(np.cosh(half))])
+        shapes = np.hstack([np.tile(previous.shape[:-1], (rates.size, 1)), pairs])
+    starts += [(shapes, share * previous.delays) for share in _SCANNED_DELAYS]
     return starts
 
 
-def _select_starts(grid: _Grid, rows: _Rows, starts: Sequence[_Start]) -> list[_Start]:
-    """Select the starting point with the least squares, after a fit of the linear part."""
-    if len(starts) == 1:
-        return list(starts)
-    shapes = np.array([_clip_shape(grid, shape) for shape, _ in starts])
-    delays = np.array([delay for _, delay in starts])
-    columns, _ = _read(grid, _respond(grid, shapes), delays, rows)
-    columns *= rows.root
-    gram = columns @ columns.transpose(0, 2, 1)
-    ridge = _make_ridge(columns, shapes.shape[1] * delays.shape[1])
-    diagonal = np.arange(gram.shape[1])
-    gram[:, diagonal, diagonal] += ridge
-    right = columns @ (rows.root * rows.value)
-    explained = np.einsum("bp,bp->b", right, _solve(gram, right))
-    return [starts[int(np.argmax(explained))]]
+def _select_start(grid: _Grid, rows: _Rows, starts: Sequence[_Start]) -> _Start:
+    """Select the start with the least squares, after a fit of the linear part to some rows."""
+    some = _Rows(*(column[:: max(rows.value.size // _START_ROWS, 1)] for column in rows))
+    value, best = some.root * some.value, (-np.inf, starts[0])
+    signals, known = None, np.empty(0)
+    for shapes, delays in starts:
+        if signals is None or shapes is not known:
+            known = shapes
+            clipped = np.array([_clip_shape(grid, shape) for shape in shapes])
+            signals = _respond(grid, _compute_impulses(clipped, grid.points))
+        columns = _read(grid, signals, delays, some)
+        gram = columns @ columns.transpose(0, 2, 1)
+        diagonal = np.arange(gram.shape[1])
+        gram[:, diagonal, diagonal] += _make_ridge(columns, shapes.shape[1] * delays.size)
+        right = columns @ value
+        explained = np.einsum("bp,bp->b", right, _solve(gram, right))
+        most = int(np.argmax(explained))
+        if explained[most] > best[0]:
+            best = (float(explained[most]), (shapes[most], delays))
+    return best[1]
 
 
 class _LeftOut(NamedTuple):
@@ -852,34 +899,34 @@ def _simulate_left_out(grid: _Grid, rows: _Rows, fit: _Fit, every: _Rows) -> Flo
         if not moved:
             break
         shapes = np.array([shape for shape, _ in moved])
-        delays = np.array([delay for _, delay in moved])
-        signals = _respond(grid, shapes)
-        columns, _ = _read(grid, signals, delays, rows)
-        columns *= rows.root
-        ridge = _make_ridge(columns, fit.shape.size * fit.delays.size)
+        signals = _respond(grid, _compute_impulses(shapes, grid.points))
         rejected = []
         for i, number in enumerate(waiting):
-            seen = left_out[number].seen
-            linear, squares = _fit_linear(columns[i][:, seen], ridge[i], rows, seen)
+            seen, delays = left_out[number].seen, moved[i][1]
+            linear, squares = _fit_linear(grid, signals.select(i), delays, _take(rows, seen))
             before = float(np.sum(np.square(fit.errors[seen])))
             if squares > before and share != _STEP_SHARES[-1]:
                 rejected.append(number)
                 continue
             own = every.block // 2 == number
-            part = _Rows(*(column[own] for column in every))
-            single = _Signals(*(signal[i : i + 1] for signal in signals))
-            read, _ = _read(grid, single, delays[i : i + 1], part)
-            predicted[own] = linear @ read[0]
+            part = _take(every, own)._replace(root=np.ones(np.count_nonzero(own)))
+            predicted[own] = linear @ _read(grid, signals.select(i), delays, part)[0]
         waiting = rejected
     return predicted
 
 
+def _take(rows: _Rows, chosen: BoolArray) -> _Rows:
+    return _Rows(*(column[chosen] for column in rows))
+
+
 def _fit_linear(
-    columns: FloatArray, ridge: FloatArray, rows: _Rows, seen: BoolArray
+    grid: _Grid, signals: _Signals, delays: FloatArray, rows: _Rows
 ) -> tuple[FloatArray, float]:
-    """Fit the linear coefficients to some rows; return their squares too."""
-    value = (rows.root * rows.value)[seen]
+    """Fit the linear coefficients (P,) to rows; return their squares too."""
+    [columns] = _read(grid, signals, delays, rows)
+    value = rows.root * rows.value
     gram = columns @ columns.T
-    gram[np.diag_indices_from(gram)] += ridge
+    size = signals.responses.shape[1] * signals.responses.shape[2]
+    gram[np.diag_indices_from(gram)] += _make_ridge(columns[None], size)[0]
     linear = _solve(gram, columns @ value)
     return linear, float(np.sum(np.square(value - linear @ columns)))
