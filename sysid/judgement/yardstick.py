@@ -15,7 +15,7 @@ was fitted to them too. So it is at an advantage, and what is said against it is
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import exp, log
+from math import exp, log, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -47,6 +47,7 @@ _BLOCKS = 10  # left out in turn, over all experiments
 _WARM_UP = 0.1  # of every experiment: it tells where the states start, and is not compared
 _MIN_SAMPLES = 40
 _LEAST_SHARE = 0.5  # of the samples must be compared
+_MOST_POINTS = 50_000  # of the grids of all inputs: a longer record is averaged
 _ROWS = 500  # rows of a fit: a longer record is averaged, if its dynamics are slow enough
 _STEPS_PER_TIME_CONSTANT = 12.0  # of the averaged record
 _LONGEST_DELAY = 1.0 / 3.0  # of the record
@@ -163,6 +164,8 @@ def _read_outputs(problem: Problem, simulated: FloatArray, name: str) -> _Sample
     if times.size < _MIN_SAMPLES or not np.all(np.isfinite(model)):
         return None
     spread = float(np.std(measured))
+    if spread <= ROUNDING_SHARE * float(np.max(np.abs(measured))):
+        return None
     if rms(measured - model) <= (1.0 - EXPLAINED_PERCENT / 100.0) * spread:
         return None
     return _Samples(name, experiment.astype(np.int64), times, measured, model)
@@ -220,70 +223,106 @@ class _Grid(NamedTuple):
 
 
 def _compare(records: Sequence[Record], samples: _Samples) -> Yardstick | None:
+    """Fit linear models to one output and compare; None if too little can be compared."""
     moving = _list_moving_inputs(records)
     if not moving:
         return None
-    starts = _find_starts(samples, len(records))
-    step = _choose_step(samples)
-    grid = _make_grid(records, moving, samples, starts, step)
-    blocks = _split_blocks(samples, len(records))
-    scale = float(np.std(samples.measured))
-    level = float(np.mean(samples.measured))
-    every = _Rows(
-        samples.experiment,
-        (samples.times - starts[samples.experiment]) / step + grid.first,
-        (samples.measured - level) / scale,
-        np.ones(samples.times.size),
-        blocks,
-    )
-    stride = _choose_stride(grid, every)
-    rows = every
-    if stride > 1:
-        rows = _average(every, stride)
-        coarse = _make_grid(records, moving, samples, starts, stride * step)
-        rows = rows._replace(
-            position=(rows.position - grid.first) / stride + coarse.first,
-        )
-        every = every._replace(position=(every.position - grid.first) / stride + coarse.first)
-        grid = coarse
+    period, spans = _measure_period(samples, len(records))
+    points = float(np.max(spans)) / period * len(records) * len(moving)
+    stride = max(int(np.ceil(points / _MOST_POINTS)), 1)
+    placed = _place(records, moving, samples, period, stride)
+    slower = _choose_stride(placed.grid, placed.rows)
+    if slower > 1:
+        placed = _place(records, moving, samples, period, slower * stride)
+    grid, rows, every = placed
     fit = _choose_order(grid, rows)
     if fit is None:
         return None
-    predicted = level + scale * _simulate_left_out(grid, rows, fit, every)
+    predicted = _simulate_left_out(grid, rows, fit, every)
     is_compared = np.isfinite(predicted)
     if np.count_nonzero(is_compared) < _LEAST_SHARE * samples.times.size:
         return None
-    return _assess(samples, predicted, is_compared, moving, grid, fit)
+    predicted = np.mean(samples.measured) + np.std(samples.measured) * predicted
+    delays = np.maximum(fit.delays * grid.step, 0.0).tolist()
+    return _assess(
+        samples, predicted, is_compared, fit.shape.size, dict(zip(moving, delays, strict=True))
+    )
+
+
+class _Placed(NamedTuple):
+    """Samples on a grid: the rows of a fit, which may be averages, and every sample."""
+
+    grid: _Grid
+    rows: _Rows
+    every: _Rows
+
+
+def _place(
+    records: Sequence[Record],
+    moving: Sequence[str],
+    samples: _Samples,
+    period: float,
+    stride: int,
+) -> _Placed:
+    """Place the samples on a grid whose step is `stride` sampling periods (s)."""
+    starts = np.zeros(len(records))
+    for number in np.unique(samples.experiment):
+        starts[number] = samples.times[samples.experiment == number][0]
+    grid = _make_grid(records, moving, samples, starts, stride * period)
+    every = _Rows(
+        samples.experiment,
+        (samples.times - starts[samples.experiment]) / grid.step + grid.first,
+        (samples.measured - np.mean(samples.measured)) / np.std(samples.measured),
+        np.ones(samples.times.size),
+        _split_blocks(samples, len(records)),
+    )
+    return _Placed(grid, every if stride == 1 else _average(every), every)
+
+
+def _measure_period(samples: _Samples, experiments: int) -> tuple[float, FloatArray]:
+    """Measure the sampling period (s), and how long each experiment lasts (E,).
+
+    The period is the median distance, or longer if most samples are missing.
+    """
+    spans = np.zeros(experiments)
+    steps = [np.zeros(0)]
+    for number in np.unique(samples.experiment):
+        times = samples.times[samples.experiment == number]
+        spans[number] = times[-1] - times[0]
+        steps.append(np.diff(times))
+    distances = np.concatenate(steps)
+    distances = distances[distances > 0]
+    if not distances.size:
+        return 1.0, spans
+    period = max(float(np.median(distances)), float(np.sum(spans)) / (2 * samples.times.size))
+    return period, spans
 
 
 def _assess(
     samples: _Samples,
     predicted: FloatArray,
     is_compared: BoolArray,
-    moving: Sequence[str],
-    grid: _Grid,
-    fit: "_Fit",
-) -> Yardstick:
-    """Compare both models on the left-out samples."""
+    order: int,
+    delays: Mapping[str, float],
+) -> Yardstick | None:
+    """Compare both models on the left-out samples; None if these do not move."""
     experiments = samples.experiment[is_compared]
     measured = samples.measured[is_compared]
-    own, other = samples.simulated[is_compared], predicted[is_compared]
-    size = np.sqrt(sum(_sum_centred(measured[experiments == e]) for e in np.unique(experiments)))
-    own_error, error = measured - own, measured - other
-    delays = {
-        name: max(float(delay) * grid.step, 0.0)
-        for name, delay in zip(moving, fit.delays, strict=True)
-    }
+    power = sum(_sum_centred(measured[experiments == e]) for e in np.unique(experiments))
+    own_errors = measured - samples.simulated[is_compared]
+    errors = measured - predicted[is_compared]
+    if min(power, float(own_errors @ own_errors), float(errors @ errors)) <= 0.0:
+        return None
     return Yardstick(
         samples.output,
-        fit.shape.size,
+        order,
         delays,
         int(measured.size),
-        100.0 * (1.0 - float(np.linalg.norm(error)) / size),
-        100.0 * (1.0 - float(np.linalg.norm(own_error)) / size),
-        rms(error),
-        rms(own_error),
-        _compute_gain(experiments, samples.times[is_compared], own_error, error),
+        100.0 * (1.0 - sqrt(float(errors @ errors) / power)),
+        100.0 * (1.0 - sqrt(float(own_errors @ own_errors) / power)),
+        rms(errors),
+        rms(own_errors),
+        _compute_gain(experiments, samples.times[is_compared], own_errors, errors),
     )
 
 
@@ -328,23 +367,6 @@ def _list_moving_inputs(records: Sequence[Record]) -> list[str]:
             for values in [channel.history_and_samples.values]
         )
     ]
-
-
-def _find_starts(samples: _Samples, experiments: int) -> FloatArray:
-    """Find the first time (s) of every experiment, 0 where it has no sample."""
-    starts = np.zeros(experiments)
-    for number in np.unique(samples.experiment):
-        starts[number] = samples.times[samples.experiment == number][0]
-    return starts
-
-
-def _choose_step(samples: _Samples) -> float:
-    """Choose the step (s) of the grid: the sampling period, longer if most samples are missing."""
-    steps = np.diff(samples.times)[np.diff(samples.experiment) == 0]
-    steps = steps[steps > 0]
-    if not steps.size:
-        return 1.0
-    return max(float(np.median(steps)), float(np.sum(steps)) / (2 * samples.times.size))
 
 
 def _make_grid(
@@ -416,14 +438,11 @@ def _split_blocks(samples: _Samples, experiments: int) -> IntArray:
     return blocks
 
 
-def _average(rows: _Rows, stride: int) -> _Rows:
-    """Average rows in groups of neighbours of one experiment and block."""
-    key = rows.experiment * (np.max(rows.block) + 2) + rows.block + 1
-    changes = np.concatenate([[True], np.diff(key) != 0])
-    firsts = np.flatnonzero(changes)
-    since = np.arange(key.size) - np.repeat(firsts, np.diff(np.append(firsts, key.size)))
-    begins = np.flatnonzero(changes | (since % stride == 0))
-    counts = np.diff(np.append(begins, key.size))
+def _average(rows: _Rows) -> _Rows:
+    """Average the rows of each step of the grid, apart for each experiment and block."""
+    keys = np.stack([rows.experiment, rows.block, np.floor(rows.position).astype(np.int64)])
+    begins = np.flatnonzero(np.any(np.diff(keys, axis=1, prepend=-2) != 0, axis=0))
+    counts = np.diff(np.append(begins, rows.value.size))
     return _Rows(
         rows.experiment[begins],
         np.add.reduceat(rows.position, begins) / counts,
