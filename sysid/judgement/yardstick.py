@@ -383,6 +383,8 @@ def _make_grid(
     spans = np.maximum(ends - starts, 0.0)
     points = int(np.ceil(np.max(spans) / step)) + 3
     before = max(start - _find_first_time(r) for start, r in zip(starts, records, strict=True))
+    if len(records) > 1:  # each starts where its input was held, at a value of its own
+        before = _LONGEST_DELAY * points * step
     first = int(np.clip(before / step, 0.0, _LONGEST_DELAY * points))
     inputs = np.zeros((len(records), len(moving), first + points))
     for number, record in enumerate(records):
@@ -390,7 +392,7 @@ def _make_grid(
         for channel in record.inputs:
             if channel.name in moving:
                 inputs[number, moving.index(channel.name)] = _average_input(channel, edges)
-    inputs -= inputs[:, :, :1]
+    inputs -= np.mean(inputs[:, :, :1], axis=0)
     sizes = np.sqrt(np.mean(np.square(inputs), axis=(0, 2), keepdims=True))
     inputs /= np.where(sizes > 0, sizes, 1.0)
     length = pad_length(2 * (first + points))
@@ -589,7 +591,7 @@ def _solve(gram: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(scaled, (right / size)[..., None])[..., 0] / size)
 
 
-class _Fit(NamedTuple):
+class _Expansion(NamedTuple):
     """A fitted shape (n,), its delays (U,) in steps, and what a step from there needs.
 
     `columns` (R, P) are the slopes over linear coefficients, shape and delays, times the roots of
@@ -604,7 +606,7 @@ class _Fit(NamedTuple):
     errors: FloatArray
 
 
-def _linearise(grid: _Grid, rows: _Rows, shape: FloatArray, delays: FloatArray) -> _Fit:
+def _linearise(grid: _Grid, rows: _Rows, shape: FloatArray, delays: FloatArray) -> _Expansion:
     """Fit the linear coefficients and compute the slopes over all parameters."""
     order, channels = shape.size, delays.size
     moved = np.vstack([shape, shape + _DIFFERENCE * np.eye(order)])
@@ -634,7 +636,7 @@ def _linearise(grid: _Grid, rows: _Rows, shape: FloatArray, delays: FloatArray) 
         by_delay[u] = -places.slope(summed, summed[places.index])
     whole = np.vstack([columns, rows.root * by_shape, rows.root * by_delay]).T
     tiny = _RIDGE**2 * np.einsum("rp,rp->p", whole[:, linear.size :], whole[:, linear.size :])
-    return _Fit(shape, delays, squares, whole, np.concatenate([ridge, tiny + 1e-200]), errors)
+    return _Expansion(shape, delays, squares, whole, np.concatenate([ridge, tiny + 1e-200]), errors)
 
 
 def _clip_shape(grid: _Grid, shape: FloatArray) -> FloatArray:
@@ -659,7 +661,7 @@ def _clip_shape(grid: _Grid, shape: FloatArray) -> FloatArray:
     return clipped
 
 
-def _minimise(grid: _Grid, rows: _Rows, shape: FloatArray, delays: FloatArray) -> _Fit:
+def _minimise(grid: _Grid, rows: _Rows, shape: FloatArray, delays: FloatArray) -> _Expansion:
     """Minimise the squares over shape and delays (Levenberg 1944, Marquardt 1963)."""
     fit = _linearise(grid, rows, _clip_shape(grid, shape), delays)
     damping = 1e-2
@@ -683,7 +685,7 @@ def _minimise(grid: _Grid, rows: _Rows, shape: FloatArray, delays: FloatArray) -
     return fit
 
 
-def _move(grid: _Grid, fit: _Fit, move: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _move(grid: _Grid, fit: _Expansion, move: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Move shape and delays, within their bounds; logarithms move by 1 at most."""
     shape = _clip_shape(grid, fit.shape + np.clip(move[: fit.shape.size], -1.0, 1.0))
     delays = np.clip(fit.delays + move[fit.shape.size :], -1.0, float(grid.longest_delay))
@@ -771,13 +773,13 @@ def _choose_stride(grid: _Grid, rows: _Rows) -> int:
     return int(np.clip(1.0 / (_STEPS_PER_TIME_CONSTANT * fastest), 1, most))
 
 
-def _choose_order(grid: _Grid, rows: _Rows) -> _Fit | None:
+def _choose_order(grid: _Grid, rows: _Rows) -> _Expansion | None:
     """Fit each order and choose the one that simulates left-out blocks best."""
     rates = np.log(_list_rates(grid))
     real = _scan_inputs(grid, rows, rates[:, None])
     pairs = [(rate, log(damping)) for rate in rates for damping in _SCANNED_DAMPING]
     resonant = _scan_inputs(grid, rows, np.array(pairs))
-    best: _Fit | None = None
+    best: _Expansion | None = None
     least, previous = np.full((int(np.max(rows.block)) + 1) // 2, np.inf), None
     for order in ORDERS:
         free_parameters = (order + 1) * (grid.inputs.shape[0] + grid.inputs.shape[1]) + order
@@ -802,7 +804,7 @@ def _list_starts(
     order: int,
     real: Sequence[_Peak],
     resonant: Sequence[_Peak],
-    previous: _Fit | None,
+    previous: _Expansion | None,
 ) -> list[_Start]:
     """List starting shapes (S, n) with their delays: peaks, and one order less with a new pole."""
     peaks = real if previous is None else resonant
@@ -812,17 +814,27 @@ def _list_starts(
         return [(shapes, delays)]
     starts = list[_Start]()
     if order % 2 == 0:
-        rest = np.tile(previous.shape[:-1], (len(peaks), 1))
-        starts.append((np.hstack([rest, shapes]), delays))
+        starts.append((np.hstack([_repeat(previous.shape[:-1], delays), shapes]), delays))
     rates = np.log(np.geomspace(2.0 / grid.points, 1.0, _NEW_POLES))
-    if order % 2:
-        shapes = np.column_stack([np.tile(previous.shape, (rates.size, 1)), rates])
+    pairs, last = previous.shape[:-1], previous.shape[-1]
+    if order % 2 and last > 0:  # two real poles: the slow one may integrate, so it comes last
+        spread = np.arccosh(np.exp(last))
+        shapes = np.hstack([_pair(rates, pairs[-1] + spread), _repeat(pairs[-1] - spread, rates)])
+    elif order % 2:
+        shapes = np.hstack([_repeat(previous.shape, rates), rates[:, None]])
     else:
-        half = 0.5 * (rates - previous.shape[-1])
-        pairs = np.column_stack([0.5 * (rates + previous.shape[-1]), np.log(np.cosh(half))])
-        shapes = np.hstack([np.tile(previous.shape[:-1], (rates.size, 1)), pairs])
+        shapes = np.hstack([_repeat(pairs, rates), _pair(rates, last)])
     starts += [(shapes, share * previous.delays) for share in _SCANNED_DELAYS]
     return starts
+
+
+def _pair(rates: FloatArray, other: float) -> FloatArray:
+    """Return sections (S, 2) with the poles of each of S rates and another, all logarithms."""
+    return np.column_stack([0.5 * (rates + other), np.log(np.cosh(0.5 * (rates - other)))])
+
+
+def _repeat(values: FloatArray, rates: FloatArray) -> FloatArray:
+    return np.tile(values, (rates.size, 1))
 
 
 def _select_start(grid: _Grid, rows: _Rows, starts: Sequence[_Start]) -> _Start:
@@ -847,7 +859,7 @@ def _select_start(grid: _Grid, rows: _Rows, starts: Sequence[_Start]) -> _Start:
     return best[1]
 
 
-class _LeftOut(NamedTuple):
+class _Omission(NamedTuple):
     """A block left out of the rows (R,): which are in it, and which the fit without it sees.
 
     `move` (P,) is that of all parameters. `is_told`: the rows that are seen determine what is
@@ -860,7 +872,7 @@ class _LeftOut(NamedTuple):
     is_told: bool
 
 
-def _leave_out(fit: _Fit, rows: _Rows) -> list[_LeftOut]:
+def _leave_out(fit: _Expansion, rows: _Rows) -> list[_Omission]:
     """Leave out each block with half a block at either side, by a Gauss–Newton step.
 
     The sides are left out because coloured noise there knows the noise in the block (h-block
@@ -888,11 +900,11 @@ def _leave_out(fit: _Fit, rows: _Rows) -> list[_LeftOut]:
         inside = fit.columns[mask] / size[i]
         variance = float(np.sum((inside @ inverse[i]) * inside))
         is_told = variance <= float(np.count_nonzero(mask))
-        left_out.append(_LeftOut(mask, ~hidden[i], moves[i], is_told))
+        left_out.append(_Omission(mask, ~hidden[i], moves[i], is_told))
     return left_out
 
 
-def _sum_left_out(fit: _Fit, rows: _Rows) -> FloatArray:
+def _sum_left_out(fit: _Expansion, rows: _Rows) -> FloatArray:
     """Sum the squared errors of each left-out block (B,), linear in all parameters.
 
     It is nan for a block that the others do not tell.
@@ -907,7 +919,7 @@ def _sum_left_out(fit: _Fit, rows: _Rows) -> FloatArray:
     )
 
 
-def _simulate_left_out(grid: _Grid, rows: _Rows, fit: _Fit, every: _Rows) -> FloatArray:
+def _simulate_left_out(grid: _Grid, rows: _Rows, fit: _Expansion, every: _Rows) -> FloatArray:
     """Simulate each block of all samples with parameters fitted without it; nan elsewhere."""
     predicted = np.full(every.value.size, np.nan)
     left_out = _leave_out(fit, rows)
