@@ -6,11 +6,12 @@ no bias. The inputs share the poles. Numerators, starts and an offset enter line
 projected out (Golub and Pereyra 1973); poles and time lags are moved by Levenberg–Marquardt. The
 starting points are the peaks of a scan: shapes of one or two poles by all time lags, by FFT.
 
-The order is the one whose left-out blocks are simulated best, by the formula of Allen's PRESS
-(Technometrics 16 (1974) 125) for blocks. For it each block is then really left out: poles and lags
-take a Gauss–Newton step without it, the linear part is fitted without it, and the whole record is
-simulated. The block is compared with that. The user's model is compared on the same samples, but it
-was fitted to them too. So it is at an advantage, and what is said against it is safe.
+The order is the one whose left-out blocks are simulated best. Blocks are left out linearly first,
+as in Allen's PRESS (Technometrics 16 (1974) 125). For the best orders they are really left out:
+poles and lags take a Gauss–Newton step without a block, the linear part is fitted without it, and
+the whole record is simulated. The block is compared with that. The user's model is compared on the
+same samples, but it was fitted to them too. So it is at an advantage, and what is said against it
+is safe.
 """
 
 from collections.abc import Mapping, Sequence
@@ -235,18 +236,30 @@ def _compare(records: Sequence[Record], samples: _Samples) -> Yardstick | None:
     if slower > 1:
         placed = _place(records, moving, samples, period, slower * stride)
     grid, rows, every = placed
-    fit = _choose_order(grid, rows)
-    if fit is None:
+    best, least = None, np.inf
+    for fit in reversed(_fit_orders(grid, rows)):
+        simulated = _simulate_left_out(grid, rows, fit, every)
+        square = _compute_mean_square(simulated, every)
+        if square >= least:
+            break
+        best, least = (fit, simulated), square
+    if best is None:
         return None
-    predicted = _simulate_left_out(grid, rows, fit, every)
+    fit, predicted = best
     is_compared = np.isfinite(predicted)
-    if np.count_nonzero(is_compared) < _LEAST_SHARE * samples.times.size:
-        return None
     predicted = np.mean(samples.measured) + np.std(samples.measured) * predicted
     delays = np.maximum(fit.delays * grid.step, 0.0).tolist()
     return _assess(
         samples, predicted, is_compared, fit.shape.size, dict(zip(moving, delays, strict=True))
     )
+
+
+def _compute_mean_square(simulated: FloatArray, every: _Rows) -> float:
+    """Compute the mean square error of left-out blocks; infinite if most are not told."""
+    told = np.isfinite(simulated)
+    if np.mean(told) < _LEAST_SHARE:
+        return float(np.inf)
+    return float(np.mean(np.square(every.value[told] - simulated[told])))
 
 
 class _Placed(NamedTuple):
@@ -773,13 +786,13 @@ def _choose_stride(grid: _Grid, rows: _Rows) -> int:
     return int(np.clip(1.0 / (_STEPS_PER_TIME_CONSTANT * fastest), 1, most))
 
 
-def _choose_order(grid: _Grid, rows: _Rows) -> _Expansion | None:
-    """Fit each order and choose the one that simulates left-out blocks best."""
+def _fit_orders(grid: _Grid, rows: _Rows) -> list[_Expansion]:
+    """Fit each order; list those that simulate left-out blocks better than all lower ones."""
     rates = np.log(_list_rates(grid))
     real = _scan_inputs(grid, rows, rates[:, None])
     pairs = [(rate, log(damping)) for rate in rates for damping in _SCANNED_DAMPING]
     resonant = _scan_inputs(grid, rows, np.array(pairs))
-    best: _Expansion | None = None
+    better = list[_Expansion]()
     least, previous = np.full((int(np.max(rows.block)) + 1) // 2, np.inf), None
     for order in ORDERS:
         free_parameters = (order + 1) * (grid.inputs.shape[0] + grid.inputs.shape[1]) + order
@@ -792,8 +805,9 @@ def _choose_order(grid: _Grid, rows: _Rows) -> _Expansion | None:
         if np.mean(known) < _LEAST_SHARE:
             continue
         if np.sum(squares[known]) < _WORTHWHILE * np.sum(least[known]):
-            least, best = squares, previous
-    return best
+            least = squares
+            better.append(previous)
+    return better
 
 
 _Start = tuple[FloatArray, FloatArray]
