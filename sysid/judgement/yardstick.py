@@ -9,13 +9,14 @@ starting points are the peaks of a scan: shapes of one or two poles by all time 
 The order is the one whose left-out blocks are simulated best. Blocks are left out linearly first,
 as in Allen's PRESS (Technometrics 16 (1974) 125). For the best orders they are really left out:
 poles and lags take a Gauss–Newton step without a block, the linear part is fitted without it, and
-the whole record is simulated. The block is compared with that. The user's model is compared on the
-same samples, but it was fitted to them too. So it is at an advantage, and what is said against it
-is safe.
+the whole record is simulated. The block is compared with that. The user's model is compared on
+the same samples, but it was fitted to them too. So it is at an advantage, and what is said against
+it is safe. Time lags, shapes and orders were chosen with all blocks, and the best of many choices
+fits even noise. So the logarithm of their number is subtracted from the gain (Bonferroni).
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from math import exp, log, sqrt
 from typing import NamedTuple
 
@@ -35,17 +36,15 @@ from sysid.simulation.problem import Problem
 ORDERS = (1, 2, 3, 4)
 """Orders that are tried."""
 
-CLEAR_GAIN = 8.0
-"""Logarithm of the likelihood ratio from which on a yardstick is clearly better.
-
-Schwarz's penalty for one direction in 10,000 samples is 4.6, and odds of 20 : 1 are 3.0.
-"""
+CLEAR_GAIN = log(20.0)
+"""Gain from which on a yardstick is clearly better: odds of 20 : 1."""
 
 NOTABLE_SHARE = 0.15
 """Share of the mean square error of the user's model that a notable yardstick saves."""
 
 _BLOCKS = 10  # left out in turn, over all experiments
 _WARM_UP = 0.1  # of every experiment: it tells where the states start, and is not compared
+_ROWS_PER_PARAMETER = 5
 _MIN_SAMPLES = 40
 _LEAST_SHARE = 0.5  # of the samples must be compared
 _MOST_POINTS = 50_000  # of the grids of all inputs: a longer record is averaged
@@ -245,13 +244,19 @@ def _compare(records: Sequence[Record], samples: _Samples) -> Yardstick | None:
         best, least = (fit, simulated), square
     if best is None:
         return None
-    fit, predicted = best
-    is_compared = np.isfinite(predicted)
-    predicted = np.mean(samples.measured) + np.std(samples.measured) * predicted
-    delays = np.maximum(fit.delays * grid.step, 0.0).tolist()
-    return _assess(
-        samples, predicted, is_compared, fit.shape.size, dict(zip(moving, delays, strict=True))
-    )
+    fit, simulated = best
+    delays = dict(zip(moving, np.maximum(fit.delays * grid.step, 0.0).tolist(), strict=True))
+    yardstick = _assess(samples, simulated, fit.shape.size, delays)
+    if yardstick is None:
+        return None
+    return replace(yardstick, gain=yardstick.gain - _count_choices(grid))
+
+
+def _count_choices(grid: _Grid) -> float:
+    """Count the time lags and shapes that were tried for each input, and the orders: logarithm."""
+    rates = _list_rates(grid).size
+    each = (grid.longest_delay + 1) * rates * (1 + len(_SCANNED_DAMPING))
+    return log(len(ORDERS)) + grid.inputs.shape[1] * log(each)
 
 
 def _compute_mean_square(simulated: FloatArray, every: _Rows) -> float:
@@ -312,13 +317,16 @@ def _measure_period(samples: _Samples, experiments: int) -> tuple[float, FloatAr
 
 
 def _assess(
-    samples: _Samples,
-    predicted: FloatArray,
-    is_compared: BoolArray,
-    order: int,
-    delays: Mapping[str, float],
+    samples: _Samples, simulated: FloatArray, order: int, delays: Mapping[str, float]
 ) -> Yardstick | None:
-    """Compare both models on the left-out samples; None if these do not move."""
+    """Compare both models on left-out samples; None if most are not told, or do not move.
+
+    `simulated` (N,) is centred and of unit size, as the rows are, and nan where it is not told.
+    """
+    is_compared = np.isfinite(simulated)
+    if np.mean(is_compared) < _LEAST_SHARE:
+        return None
+    predicted = np.mean(samples.measured) + np.std(samples.measured) * simulated
     experiments = samples.experiment[is_compared]
     measured = samples.measured[is_compared]
     power = sum(_sum_centred(measured[experiments == e]) for e in np.unique(experiments))
@@ -761,7 +769,9 @@ def _scan(grid: _Grid, channel: int, target: FloatArray, shapes: FloatArray) -> 
 
 def _scan_inputs(grid: _Grid, rows: _Rows, shapes: FloatArray) -> list[_Peak]:
     """Scan the inputs one after the other, each for what the others leave (backfitting)."""
-    target, weight = _spread(grid, rows, rows.value), _spread(grid, rows, np.ones(rows.value.size))
+    weight = _spread(grid, rows, np.ones(rows.value.size))
+    target = _spread(grid, rows, rows.value)
+    target -= weight * (np.sum(target) / np.sum(weight))
     channels = grid.inputs.shape[1]
     peaks: dict[int, _Peak] = {}
     for _ in range(1 if channels == 1 else 2):
@@ -788,26 +798,32 @@ def _choose_stride(grid: _Grid, rows: _Rows) -> int:
 
 def _fit_orders(grid: _Grid, rows: _Rows) -> list[_Expansion]:
     """Fit each order; list those that simulate left-out blocks better than all lower ones."""
-    rates = np.log(_list_rates(grid))
-    real = _scan_inputs(grid, rows, rates[:, None])
-    pairs = [(rate, log(damping)) for rate in rates for damping in _SCANNED_DAMPING]
-    resonant = _scan_inputs(grid, rows, np.array(pairs))
-    better = list[_Expansion]()
-    least, previous = np.full((int(np.max(rows.block)) + 1) // 2, np.inf), None
-    for order in ORDERS:
-        free_parameters = (order + 1) * (grid.inputs.shape[0] + grid.inputs.shape[1]) + order
-        if 5 * free_parameters > rows.value.size:
-            break
-        starts = _list_starts(grid, order, real, resonant, previous)
-        previous = _minimise(grid, rows, *_select_start(grid, rows, starts))
-        squares = _sum_left_out(previous, rows)
+    better, least = list[_Expansion](), np.full((int(np.max(rows.block)) + 1) // 2, np.inf)
+    for fit in _fit_each_order(grid, rows):
+        squares = _sum_left_out(fit, rows)
         known = np.isfinite(squares) & ~np.isnan(least)
         if np.mean(known) < _LEAST_SHARE:
             continue
         if np.sum(squares[known]) < _WORTHWHILE * np.sum(least[known]):
             least = squares
-            better.append(previous)
+            better.append(fit)
     return better
+
+
+def _fit_each_order(grid: _Grid, rows: _Rows) -> Iterator[_Expansion]:
+    """Fit one order after the other, as far as there are rows enough."""
+    rates = np.log(_list_rates(grid))
+    real = _scan_inputs(grid, rows, rates[:, None])
+    pairs = [(rate, log(damping)) for rate in rates for damping in _SCANNED_DAMPING]
+    resonant = _scan_inputs(grid, rows, np.array(pairs))
+    fit: _Expansion | None = None
+    for order in ORDERS:
+        parameters = (order + 1) * sum(grid.inputs.shape[:2]) + order
+        if _ROWS_PER_PARAMETER * parameters > rows.value.size:
+            return
+        starts = _list_starts(grid, order, real, resonant, fit)
+        fit = _minimise(grid, rows, *_select_start(grid, rows, starts))
+        yield fit
 
 
 _Start = tuple[FloatArray, FloatArray]
@@ -886,35 +902,42 @@ class _Omission(NamedTuple):
     is_told: bool
 
 
-def _leave_out(fit: _Expansion, rows: _Rows) -> list[_Omission]:
-    """Leave out each block with half a block at either side, by a Gauss–Newton step.
+def _hide(rows: _Rows) -> list[tuple[BoolArray, BoolArray]]:
+    """List the rows in each block, and those that are seen without it.
 
-    The sides are left out because coloured noise there knows the noise in the block (h-block
-    cross-validation: Burman, Chow and Nolan, Biometrika 81 (1994) 351).
+    Half a block at either side is not seen, because coloured noise there knows the noise in the
+    block (h-block cross-validation: Burman, Chow and Nolan, Biometrika 81 (1994) 351).
+    """
+    parts = []
+    for first in range(0, int(np.max(rows.block)) + 1, 2):
+        mask = (rows.block == first) | (rows.block == first + 1)
+        is_near = (rows.block >= max(first - 1, 0)) & (rows.block <= first + 2)
+        is_near &= np.isin(rows.experiment, rows.experiment[mask])
+        parts.append((mask, ~(mask | is_near)))
+    return parts
+
+
+def _leave_out(fit: _Expansion, rows: _Rows) -> list[_Omission]:
+    """Leave out each block by a Gauss–Newton step.
 
     The mean variance of what is then simulated, over that of the noise, is the mean diagonal of
     J A⁻¹ Jᵀ, where A is the sum of products of the rows that are seen. Up to 1 the block is told.
     """
-    masks, hidden = [], []
-    for number in range(0, int(np.max(rows.block)) + 1, 2):
-        mask = (rows.block == number) | (rows.block == number + 1)
-        is_near = (rows.block >= max(number - 1, 0)) & (rows.block <= number + 2)
-        masks.append(mask)
-        hidden.append(mask | (is_near & (rows.experiment == rows.experiment[np.argmax(mask)])))
+    parts = _hide(rows)
     gram = fit.columns.T @ fit.columns
     gram[np.diag_indices_from(gram)] += fit.ridge
-    others = np.array([gram - fit.columns[one].T @ fit.columns[one] for one in hidden])
-    right = np.array([fit.columns[one].T @ fit.errors[one] for one in hidden])
+    others = np.array([gram - fit.columns[~seen].T @ fit.columns[~seen] for _, seen in parts])
+    right = np.array([fit.columns[~seen].T @ fit.errors[~seen] for _, seen in parts])
     size = np.sqrt(np.maximum(np.einsum("bpp->bp", others), 1e-300))
     scaled = others / (size[:, :, None] * size[:, None, :])
     inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True)
     moves = -np.einsum("bpq,bq->bp", inverse, right / size) / size
     left_out = []
-    for i, mask in enumerate(masks):
+    for i, (mask, seen) in enumerate(parts):
         inside = fit.columns[mask] / size[i]
         variance = float(np.sum((inside @ inverse[i]) * inside))
         is_told = variance <= float(np.count_nonzero(mask))
-        left_out.append(_Omission(mask, ~hidden[i], moves[i], is_told))
+        left_out.append(_Omission(mask, seen, moves[i], is_told))
     return left_out
 
 
@@ -954,10 +977,15 @@ def _simulate_left_out(grid: _Grid, rows: _Rows, fit: _Expansion, every: _Rows) 
                 rejected.append(number)
                 continue
             own = every.block // 2 == number
-            part = _take(every, own)._replace(root=np.ones(np.count_nonzero(own)))
-            predicted[own] = linear @ _read(grid, signals.select(i), delays, part)[0]
+            columns = _read_plain(grid, signals.select(i), delays, _take(every, own))
+            predicted[own] = linear @ columns
         waiting = rejected
     return predicted
+
+
+def _read_plain(grid: _Grid, signals: _Signals, delays: FloatArray, samples: _Rows) -> FloatArray:
+    """Read the columns (P, N) of one shape for samples, without weights."""
+    return _read(grid, signals, delays, samples._replace(root=np.ones(samples.value.size)))[0]
 
 
 def _take(rows: _Rows, chosen: BoolArray) -> _Rows:
