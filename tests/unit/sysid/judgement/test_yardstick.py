@@ -71,6 +71,19 @@ def test_the_true_model_is_not_beaten() -> None:
         assert found.rms == pytest.approx(found.own_rms, rel=0.05)
 
 
+def test_slow_noise_and_an_idle_input_make_no_better_model() -> None:
+    model = {**TWO_INPUTS, "outputs": {"y": {"expression": "x"}}}
+    for seed in range(5):
+        rng = np.random.default_rng(100 + seed)
+        u, clean, y = record_first_order(seed, 800, noise=0.0)
+        for k in range(1, 800):
+            y[k] += 0.98 * (y[k - 1] - clean[k - 1]) + 0.1 * rng.standard_normal()
+        t = np.arange(800.0)
+        inputs = [Channel("u", t, u), Channel("v", t, switch(rng, 800, 30))]
+        problem = Problem.build(load_model(model), [Record(inputs, Channel("y", t, y))])
+        assert not compare(problem, clean).is_clearly_better
+
+
 def test_fit_and_rms_are_of_the_same_samples() -> None:
     u, clean, y = record_first_order(2)
     problem = build(u, y)
