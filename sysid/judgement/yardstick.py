@@ -69,7 +69,7 @@ _START_ROWS = 200  # by which starts are compared
 _SCANNED_DELAYS = (1.0, 0.7, 0.3, 0.0)  # of the delays of one order less
 _EVALUATIONS = 14  # of the columns, for each order
 _CONVERGED = 1e-3  # relative decrease of the squares
-_WORTHWHILE = 0.99  # of the left-out squares: less is worth another order
+_WORTHWHILE = 0.99  # of the squares: less is worth another order
 _STEP_SHARES = (1.0, 0.5, 0.2)  # of a step without a block, until it lowers the squares
 _DIFFERENCE = 1e-3  # of a logarithm, for slopes by differences
 _START_RIDGE = 1e-3  # noise over the prior deviation of a start, both in deviations of the output
@@ -828,8 +828,11 @@ def _fit_each_order(grid: _Grid, rows: _Rows) -> Iterator[_Expansion]:
         if _ROWS_PER_PARAMETER * parameters > rows.value.size:
             return
         starts = _list_starts(grid, order, real, resonant, fit)
-        fit = _minimise(grid, rows, *_select_start(grid, rows, starts))
+        lower, fit = fit, _minimise(grid, rows, *_select_start(grid, rows, starts))
         yield fit
+        is_settled = lower is not None and fit.squares > _WORTHWHILE * lower.squares
+        if is_settled and order > 2:  # a resonance may need two poles at once
+            return
 
 
 _Start = tuple[FloatArray, FloatArray]
