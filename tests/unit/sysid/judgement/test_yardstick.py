@@ -7,6 +7,10 @@ import pytest
 
 from sysid.data.records import Channel, Record
 from sysid.judgement import yardstick
+from sysid.judgement.input_grid import GridRows, average_input
+from sysid.judgement.left_out_blocks import leave_out_blocks
+from sysid.judgement.linear_fits import LinearFit
+from sysid.judgement.state_responses import compute_impulses
 from sysid.judgement.yardstick import Yardstick, fit_yardstick
 from sysid.models.catalogue.load import load_model
 from sysid.simulation.problem import Problem
@@ -220,17 +224,17 @@ def test_one_step_alone_tells_nothing_of_the_block_that_holds_it() -> None:
 
 def test_impulse_responses_are_those_of_the_closed_forms() -> None:
     rate, damping = 0.2, 0.3
-    [[first]] = yardstick._compute_impulses(np.log([[rate]]), 50)
+    [[first]] = compute_impulses(np.log([[rate]]), 50)
     pole = np.exp(-rate)
     np.testing.assert_allclose(first, (1 - pole) * pole ** np.arange(50), rtol=1e-10)
-    [second] = yardstick._compute_impulses(np.log([[rate, damping]]), 50)
+    [second] = compute_impulses(np.log([[rate, damping]]), 50)
     t = np.arange(51.0)
     damped = rate * np.sqrt(1 - damping**2)
     step = 1 - np.exp(-damping * rate * t) * (
         np.cos(damped * t) + damping / np.sqrt(1 - damping**2) * np.sin(damped * t)
     )
     np.testing.assert_allclose(second[0], np.diff(step), atol=1e-10)
-    [chain] = yardstick._compute_impulses(np.log([[rate, damping, 0.1]]), 2000)
+    [chain] = compute_impulses(np.log([[rate, damping, 0.1]]), 2000)
     assert np.sum(chain[2]) == pytest.approx(1.0)  # every section has gain 1
 
 
@@ -239,11 +243,11 @@ def test_a_left_out_block_moves_linear_parameters_as_a_fit_without_it_does() -> 
     columns, value = rng.standard_normal((120, 3)), rng.standard_normal(120)
     best = np.linalg.lstsq(columns, value)[0]
     errors = value - columns @ best
-    fit = yardstick._Expansion(np.zeros(1), np.zeros(1), 0.0, columns, np.zeros(3), errors)
+    fit = LinearFit(np.zeros(1), np.zeros(1), 0.0, columns, np.zeros(3), errors)
     block = np.concatenate([np.full(20, -1), np.repeat(np.arange(10), 10)])
     ones = np.ones(120)
-    rows = yardstick._Rows(np.zeros(120, dtype=np.int64), np.arange(120.0), value, ones, block)
-    for number, left_out in enumerate(yardstick._leave_out(fit, rows)):
+    rows = GridRows(np.zeros(120, dtype=np.int64), np.arange(120.0), value, ones, block)
+    for number, left_out in enumerate(leave_out_blocks(fit, rows)):
         np.testing.assert_array_equal(left_out.mask, block // 2 == number)
         hidden = (block >= 0) & (block >= 2 * number - 1) & (block <= 2 * number + 2)
         np.testing.assert_array_equal(left_out.seen, ~hidden)
@@ -256,12 +260,10 @@ def test_a_left_out_block_moves_linear_parameters_as_a_fit_without_it_does() -> 
 def test_inputs_are_averaged_between_the_edges() -> None:
     edges = np.array([-1.0, 0.0, 1.0, 1.5, 4.0])
     held = Channel("u", [0.0, 1.0, 3.0], [2.0, 4.0, 0.0], hold="zero")
-    np.testing.assert_allclose(
-        yardstick._average_input(held, edges), [2.0, 2.0, 4.0, (1.5 * 4.0) / 2.5]
-    )
+    np.testing.assert_allclose(average_input(held, edges), [2.0, 2.0, 4.0, (1.5 * 4.0) / 2.5])
     straight = Channel("u", [0.0, 1.0, 3.0], [2.0, 4.0, 0.0], hold="first")
     np.testing.assert_allclose(
-        yardstick._average_input(straight, edges), [2.0, 3.0, 3.5, 0.5 * 3.0 * 1.5 / 2.5]
+        average_input(straight, edges), [2.0, 3.0, 3.5, 0.5 * 3.0 * 1.5 / 2.5]
     )
 
 
