@@ -13,6 +13,7 @@ import typer
 
 from service.cli.common import (
     DATA_HELP,
+    ESTIMATE_HEADINGS,
     MODEL_SUFFIXES,
     OUTPUT_PANEL,
     STANDARD_INPUT,
@@ -29,7 +30,7 @@ from service.cli.common import (
     fail,
     fail_usage,
     file_origins,
-    format_estimate,
+    list_estimate_cells,
     name_file,
     out,
     parse_channels,
@@ -267,8 +268,13 @@ def check_body(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
         _refuse_model(body["model"], error)
     from service.jobs.record_checks import find_setting_faults
     from sysid.models.model import build_initial_parameters
+    from sysid.models.starts import replace_starts
 
-    parameters = (*model.parameters, *build_initial_parameters(model, pieces))
+    try:
+        started = replace_starts(model, job.initial)
+    except SysidError as error:
+        fail_usage(FIELD_ORIGINS.describe_faults(to_field_errors(error)))
+    parameters = (*model.parameters, *build_initial_parameters(started, pieces))
     wrong = find_setting_faults(job.to_normal_form(), model, parameters)
     if wrong:
         fail_usage(FIELD_ORIGINS.describe_faults(wrong))
@@ -375,16 +381,8 @@ def print_result(
         return
     print_line(f"verdict: {result.verdict.text}")
     print_table(
-        ("parameter", ">estimate ± standard error", "unit", "status"),
-        (
-            (
-                parameter["name"],
-                format_estimate(parameter),
-                parameter["unit"],
-                parameter["status"],
-            )
-            for parameter in document["parameters"]
-        ),
+        ESTIMATE_HEADINGS,
+        map(list_estimate_cells, document["parameters"]),
         empty="no parameters",
     )
     unit = plain_unit(find_output_unit(result))

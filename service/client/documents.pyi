@@ -311,7 +311,7 @@ class ComparedValueDocument(TypedDict):
     stderr: float | None
     """standard error, in `unit`. If there is none, `reason` says why"""
     interval95: list[float | None] | None
-    """both ends of the 95 % interval by the t distribution, in `unit`"""
+    """both ends of the 95 % interval, in `unit`"""
     status: Literal[
         "identified",
         "not settled",
@@ -328,6 +328,8 @@ class ComparedValueDocument(TypedDict):
     """identified, or why the value is not to be relied on"""
     reason: str
     """reason of the status, or of a missing standard error; empty if there is nothing to say"""
+    open_ends: list[Literal["lower", "upper"]]
+    """ends of the interval up to which the data speak for any value; there it ends at the bound"""
 
 class ComparisonDocument(TypedDict):
     """Comparison of runs, the best first; `unit` is that of the RMS."""
@@ -545,7 +547,7 @@ class EstimateDocument(TypedDict):
     stderr: float | None
     """standard error, in `unit`. If there is none, `reason` says why"""
     interval95: list[float | None] | None
-    """both ends of the 95 % interval by the t distribution, in `unit`"""
+    """both ends of the 95 % interval, in `unit`"""
     status: Literal[
         "identified",
         "not settled",
@@ -562,6 +564,8 @@ class EstimateDocument(TypedDict):
     """identified, or why the value is not to be relied on"""
     reason: str
     """reason of the status, or of a missing standard error; empty if there is nothing to say"""
+    open_ends: list[Literal["lower", "upper"]]
+    """ends of the interval up to which the data speak for any value; there it ends at the bound"""
 
 class ExperimentDocument(TypedDict):
     """Measured and simulated outputs of one experiment."""
@@ -869,6 +873,8 @@ class JobInDocument(TypedDict):
     """weight of each output, one number or one for each experiment. null: 1 for one output, else 1 / its standard deviation; then the noise of each output in each experiment is estimated"""
     skip: NotRequired[int]
     """first samples of each output that are not scored"""
+    initial: NotRequired[Literal["rest", "free", "measured", "auto"] | None]
+    """where the states start: at rest under the first inputs, at estimated or at measured values. auto compares them by the data. null: as the model's document says"""
     algorithm: NotRequired[AlgorithmInDocument]
     """settings of the search"""
     priority: NotRequired[int]
@@ -1243,6 +1249,8 @@ class OrderFitDocument(TypedDict):
     """criterion of Schwarz, smaller is better; with the noise model of the comparison"""
     is_open: bool
     """whether its BIC is within 6 of the lowest: no strong evidence against it"""
+    leaves_noise: bool
+    """whether nothing but noise is left by it. Only of the preferred order this is looked for"""
 
 class OutcomeDocument(TypedDict):
     """Outcome of a job: that of its only run, or of the best one by RMS."""
@@ -1665,6 +1673,8 @@ class RunDocument(TypedDict):
     """integration steps in one grid step: the model's, or more"""
     selection: NotRequired[list[SelectedTermDocument] | None]
     """selected terms; empty if none were to be selected"""
+    initial: NotRequired[Literal["rest", "free", "measured"] | None]
+    """start of the states that the estimates assume; none: as the model's document says"""
 
 class RunPageDocument(TypedDict):
     """Runs of a job."""
@@ -1739,6 +1749,12 @@ class SelectedTermDocument(TypedDict):
     """share explained with all terms so far"""
     coefficient: float | None
     """coefficient in the model of all selected terms, before the search. It comes from one-step least squares, or from the free run if that selected the terms. Its unit follows from the term"""
+    probability: float | None
+    """probability that the term belongs to the model: the weight of the selections with it"""
+    coverage: float | None
+    """probability that the 95 % interval of the coefficient holds, over all these selections"""
+    rival: str
+    """the likeliest other selection: the change in words. Empty if term and coefficient are certain"""
 
 class SequenceInDocument(TypedDict):
     """The sequence search."""

@@ -32,6 +32,7 @@ from sysid.models.model import Model, build_initial_parameters
 from sysid.models.model_delays import check_delays, find_unused_settings
 from sysid.models.parameters import Parameter
 from sysid.models.polynomial import check_candidate_count
+from sysid.models.starts import replace_starts
 from sysid.models.ties import apply_ties, resolve_ties
 
 JobBody = dict[str, Any]
@@ -58,7 +59,7 @@ class JobChecker:
         resolved = self.resolve_model(body["model"])
         if isinstance(resolved, list):
             return faults + resolved
-        model = resolved[0]
+        model = collect_faults(replace_starts, faults, resolved[0], body["initial"]) or resolved[0]
         parameters = override_by_request(
             faults, self._list_parameters(body, model), body["parameters"]
         )

@@ -18,6 +18,7 @@ from service.items.reference_names import REFERENCE_PREFIX, RUN_PREFIX
 from sysid.core.settings import (
     FitSettings,
     GeneticAlgorithm,
+    InitialSetting,
     IslandChange,
     Loss,
     Migration,
@@ -267,6 +268,7 @@ class IdentificationIn(Body):
     loss: LossIn = Field(default=LossIn(), description="loss function")
     weights: dict[str, float | list[float]] | None = take_setting(FitSettings, "weights")
     skip: int = take_setting(FitSettings, "skip")
+    initial: InitialSetting | None = take_setting(FitSettings, "initial")
     algorithm: AlgorithmIn = Field(default=AlgorithmIn(), description="settings of the search")
     priority: int = Field(
         default=0, ge=-100, le=100, description="jobs of higher priority come first"

@@ -27,6 +27,7 @@ from service.storage.tables import Job, Run
 from sysid.data.records import Record
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter, override_parameters
+from sysid.models.starts import replace_starts
 from sysid.results.result import Result
 from sysid.uncertainty.estimates import Estimate
 
@@ -58,12 +59,22 @@ class StoredRun:
     def from_rows(cls, job: Job, run: Run) -> "StoredRun":
         """Build the value from the rows of a run and its job."""
         body = build_run_body(job.spec, run.cell)
-        return cls(job, run, body, apply_result(load_stored_model(body["model"]), run.result))
+        started = replace_starts(load_stored_model(body["model"]), body.get("initial"))
+        return cls(job, run, body, apply_result(started, run.result))
 
     @property
     def model_of_request(self) -> Model:
         """The model as requested, with all its candidate terms."""
         return load_stored_model(self.body["model"])
+
+    @property
+    def model_of_other_records(self) -> Model:
+        """The model of the result for records that need not start as the fitted ones do.
+
+        If the data told how those start, they tell nothing of others.
+        """
+        started = replace_starts(self.model_of_request, self.body.get("initial"))
+        return apply_result(started, {**self.document, "initial": None})
 
     @property
     def document(self) -> Mapping[str, Any]:
@@ -153,8 +164,9 @@ class StoredRun:
 
         model, records = self.model_of_request, self.read_fit_records(session, store)
         substeps = model.solver.substeps if self.result is None else self.result.substeps
+        initial = None if self.result is None else self.result.initial
         settings = read_fit(self.body)
-        return records, resimulate_run(model, records, settings, self.estimates, substeps)
+        return records, resimulate_run(model, records, settings, self.estimates, substeps, initial)
 
     def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
         """Select the changes of these parameters. The request may name unselected terms."""

@@ -21,6 +21,7 @@ from sysid.core.errors import InvalidModel, UnknownModel, suggest_name
 from sysid.models.catalogue import load
 from sysid.models.model import Model, replace_substeps
 from sysid.models.parse import keep_terms, parse_model
+from sysid.models.starts import replace_starts
 
 
 def list_models(
@@ -117,12 +118,14 @@ def _parse_stored(document: str) -> Model:
 
 
 def apply_result(model: Model, result: Mapping[str, Any] | None) -> Model:
-    """Return the model of a run's result document: with its selected terms and its substeps."""
+    """Return the model of a run's result document: with its terms, its substeps and its starts."""
     found = result or {}
     if model.rule is not None and found.get("selection"):
         model = keep_terms(model, [entry["term"] for entry in found["selection"]])
     substeps = found.get("substeps", model.solver.substeps)
-    return model if substeps == model.solver.substeps else replace_substeps(model, substeps)
+    if substeps != model.solver.substeps:
+        model = replace_substeps(model, substeps)
+    return replace_starts(model, found.get("initial"))
 
 
 def _get_own_model(session: Session, reference: str) -> StoredModel:

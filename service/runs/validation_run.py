@@ -177,7 +177,7 @@ def _build_problem(stored: StoredRun, records: tuple[Record, ...], skip: int) ->
     # This imports the compiler, which most requests never need.
     from sysid.simulation.problem import Problem
 
-    model, request = stored.model, stored.body
+    model, request = stored.model_of_other_records, stored.body
     own_names = {parameter.name for parameter in model.parameters}
     values = {
         estimate.name: estimate for estimate in stored.estimates if estimate.name in own_names

@@ -62,7 +62,7 @@ def _list_distinct_facts(
     """Iterate over the distinct settings of a batch."""
     seen: set[str] = set()
     for body in bodies:
-        settings = {name: body[name] for name in _COMPARED_FIELDS}
+        settings = {name: body.get(name) for name in _COMPARED_FIELDS}
         kinds = [
             sorted(
                 (channel_row["name"], channel_row["unit"], channel_row["hold"])
@@ -84,6 +84,7 @@ _COMPARED_FIELDS = (
     "weights",
     "prediction",
     "skip",
+    "initial",
     "noise",
     "parameters",
 )
@@ -140,6 +141,7 @@ def _describe_settings(body: JobBody) -> Iterator[tuple[str, str]]:
     )
     yield "prediction", body["prediction"]
     yield "skip", f"{body['skip']:d}"
+    yield "initial", body.get("initial") or "as in the model"
     yield "added noise", f"{body['noise']['sigma']:g}"
 
 

@@ -29,10 +29,13 @@ SequenceKind = Literal["paper", "adaptive"]
 PredictionKind = Literal["simulation", "one-step"]
 LossKind = Literal["squares", "soft-l1"]
 NoiseModel = Literal["auto", "white", "ar1"]
+StartKind = Literal["rest", "free", "measured"]
+InitialSetting = Literal["rest", "free", "measured", "auto"]
 SEARCH_METHODS: tuple[SearchMethod, ...] = get_args(SearchMethod)
 PREDICTION_KINDS: tuple[PredictionKind, ...] = get_args(PredictionKind)
 LOSS_KINDS: tuple[LossKind, ...] = get_args(LossKind)
 NOISE_MODELS: tuple[NoiseModel, ...] = get_args(NoiseModel)
+INITIAL_SETTINGS: tuple[InitialSetting, ...] = get_args(InitialSetting)
 MIN_POPULATION = 4
 """Fewest individuals of an island: two parents, and others for their children to replace."""
 MAX_BITS = 32
@@ -375,6 +378,9 @@ class FitSettings:
         1 / its standard deviation; then the noise of each output in each experiment is estimated.
     skip : int
         First samples of each output that are not scored.
+    initial : InitialSetting or None
+        Where the states start: at rest under the first inputs, at estimated or at measured values.
+        auto compares them by the data. None: as the model's document says.
     scored_from : tuple of float or None
         For each record the time (s) from which samples are scored. None: all samples.
     deviations : tuple of tuple of float, or None
@@ -387,6 +393,7 @@ class FitSettings:
     loss: Loss = field(default_factory=Loss)
     weights: Weights | None = None
     skip: Annotated[int, Bounds(least=0)] = 0
+    initial: InitialSetting | None = None
     scored_from: tuple[float, ...] | None = None
     deviations: tuple[tuple[float, ...], ...] | None = None
 

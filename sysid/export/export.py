@@ -16,6 +16,7 @@ from sysid.export.python_control import write_control_source
 from sysid.language.evaluation import evaluate_expression
 from sysid.models.model import Model, name_initial_state
 from sysid.models.parse import keep_terms
+from sysid.models.starts import replace_starts
 from sysid.models.ties import resolve_ties
 from sysid.results.identification import Identification
 from sysid.simulation.data_bounds import find_signal_units
@@ -81,6 +82,7 @@ def export_model(
     if isinstance(result, Identification):
         if model.rule is not None and result.selection:
             model = keep_terms(model, [term.term for term in result.selection])
+        model = replace_starts(model, result.initial)
         input_names = {signal.name for signal in model.inputs}
         holds = {**{k: v for k, v in result.holds.items() if k in input_names}, **holds}
         sample_time = result.sample_time if sample_time is None else sample_time

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.core.settings import GeneticAlgorithm
+from sysid.core.settings import GeneticAlgorithm, StartKind
 from sysid.core.types import FloatArray
 from sysid.identifiability.exchange import (
     ExchangeGroups,
@@ -20,24 +20,32 @@ from sysid.identifiability.exchange import (
 )
 from sysid.identification.budget import Budget
 from sysid.identification.deadline import Deadline
+from sysid.identification.state_conversion import convert_state
 from sysid.islands.run_state import RunState
 from sysid.islands.stopping import count_restarts
 from sysid.judgement.integration_step import (
     HalfStep,
+    can_halve_step,
     choose_starts,
     compare_half_step,
     compute_work_limit,
     find_limit,
+    halve_step,
     mark_changing,
 )
 from sysid.judgement.judge import Explained, explain_residuals
 from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
+from sysid.judgement.starts import (
+    FittedStart,
+    StartComparison,
+    compare_starts,
+)
 from sysid.judgement.unrecorded_input import RecordedComparison, compare_where_recorded
 from sysid.minima.local_minima import (
     LocalMinima,
     count_affordable_simulations,
     find_local_minima,
-    widen_intervals,
+    list_compatible_minima,
 )
 from sysid.minima.minima import (
     Fit,
@@ -62,9 +70,16 @@ from sysid.search.island import Island, compute_analysis_budget, get_island_sett
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.search.state import SAME_OPTIMUM
 from sysid.simulation.problem import Problem
+from sysid.simulation.start_values import convert_point
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
-from sysid.uncertainty.intervals import keep_in_bounds, mark_poor_intervals
+from sysid.uncertainty.intervals import (
+    ProfileEnds,
+    compose_intervals,
+    keep_in_bounds,
+    mark_poor_intervals,
+)
+from sysid.uncertainty.profile_ends import FoundEnds, extrapolate_ends, find_profile_ends
 from sysid.uncertainty.unequal_noise import fit_unequal_noise
 
 _MOST_PROJECTED = 6000  # simulations of a scan by projection
@@ -115,6 +130,10 @@ class BestEstimate:
         Of that estimate.
     explained : Explained
         What explains the residuals of least squares.
+    starts : StartComparison or None
+        The start that the estimate assumes, and the others; None if they were not compared.
+    state : RunState
+        The search, with the parameters of `problem`.
     """
 
     problem: Problem
@@ -124,6 +143,8 @@ class BestEstimate:
     noise: GeneralisedEstimate
     analysis: Analysis
     explained: Explained
+    starts: StartComparison | None
+    state: RunState
 
     @property
     def lowest_end(self) -> IslandEnd:
@@ -152,20 +173,26 @@ def find_best_estimate(
 
     The integration step is halved until the estimates and their errors stand still, or until a
     limit is reached. Then those that still change are not identified, or have the change in their
-    errors.
+    errors. If the data decide where the states start, they do so before and after that. With
+    `explains`, intervals follow the profile likelihood where the linear model does not hold.
     """
     refines = is_refining(algorithm, len(state.islands))
     search = _EstimateSearch(problem, state, budget, deadline, refines=refines)
+    search.choose_start()
     first: tuple[Estimate, ...] = ()
     limit = ""
     while True:
         search.analyse_best()
         half = search.compare_half_step()
         if half is None or not half.changes:
+            if search.choose_start():
+                continue
             break
         estimates = search.analysis.estimates
         limit = search.use_half_step(half)
         if limit:
+            if search.choose_start():
+                continue
             break
         first = first or estimates
     changes = {} if half is None else half.changes
@@ -173,11 +200,22 @@ def find_best_estimate(
     explained = search.explain(explains=explains)
     noise = search.apply_noise_model(explained, is_settled=not changes)
     minima = search.collect_minima(recorded)
-    marked = mark_changing(search.analysis.estimates, half, limit)
-    marked = mark_poor_intervals(search.problem.free_parameters, marked)
+    if explains and refines:
+        search.follow_profiles(noise.theta)
+    parameters = search.problem.free_parameters
+    marked = mark_poor_intervals(parameters, search.analysis.estimates)
+    marked = mark_poor_intervals(parameters, mark_changing(marked, half, limit))
     analysis = replace(search.analysis, estimates=keep_in_bounds(marked))
     return BestEstimate(
-        search.problem, tuple(search.ends), minima, first, noise, analysis, explained
+        search.problem,
+        tuple(search.ends),
+        minima,
+        first,
+        noise,
+        analysis,
+        explained,
+        search.starts,
+        search.state,
     )
 
 
@@ -201,7 +239,10 @@ class _EstimateSearch:
         *,
         refines: bool,
     ) -> None:
-        self.problem, self._state, self._budget = problem, state, budget
+        self.problem, self.state, self._budget = problem, state, budget
+        self._initial = problem.settings.initial
+        self._left: list[StartKind | None] = []
+        self.starts: StartComparison | None = None
         self._deadline, self._refines = deadline, refines
         self._reserved = compute_analysis_budget(len(state.islands[0].point))
         self._work = compute_work_limit(problem, state.evaluations)
@@ -268,6 +309,52 @@ class _EstimateSearch:
         ]
         self._choose_best()
 
+    def choose_start(self) -> bool:
+        """Compare the starts if the data decide on them; move to a better one, if there is one.
+
+        A start that was left is not taken again.
+        """
+        if not self._refines:
+            return False
+        self._choose_best()
+        if self._is_start_compared():
+            return False
+        most = self._budget.count_left(self._reserved)
+        late = self._deadline.is_past_grace
+        self.starts = compare_starts(self.problem, self.theta, self._initial, most, late)
+        if self.starts is None:
+            return False
+        self._budget.spend(self.starts.evaluations)
+        best = self.starts.best
+        if best is self.starts.own or best.name in self._left:
+            return False
+        self._left.append(self.starts.own.name)
+        self.starts = self.starts.take(best)
+        self._use_start(best)
+        return True
+
+    def _is_start_compared(self) -> bool:
+        """Whether the starts were compared at this estimate."""
+        if self.starts is None or self.starts.own.problem is not self.problem:
+            return False
+        return is_same_point(self.problem, self.starts.own.theta, self.theta)
+
+    def _use_start(self, best: FittedStart) -> None:
+        """Continue with another start from the ends of all islands."""
+        before, self.problem, self._scanned = self.problem, best.problem, None
+        self.state = convert_state(before, best.problem, self.state)
+        points = [convert_point(before, best.problem, end.theta) for end in self.ends]
+        points[self._best] = best.theta
+        values = best.problem.evaluate_fitness(np.array(points))
+        most = self._budget.count_left(self._reserved)
+        candidates = refine_candidates(best.problem, points, most, self._deadline.is_past_grace)
+        self.ends = [
+            self._continue_end(replace(end, theta=point, rms=rms), candidate)
+            for end, point, rms, candidate in zip(
+                self.ends, points, values.tolist(), candidates, strict=True
+            )
+        ]
+
     def compare_half_step(self) -> HalfStep | None:
         """Compare the estimate with that of half the integration step."""
         most = self._budget.count_left(self._reserved)
@@ -291,7 +378,7 @@ class _EstimateSearch:
         latest[self._best].append(half.theta)
         champions = [
             [*(np.array(one.parameters) for one in island.history), *ends]
-            for island, ends in zip(self._state.islands, latest, strict=True)
+            for island, ends in zip(self.state.islands, latest, strict=True)
         ]
         starts, values, spent = choose_starts(half, champions)
         self._budget.spend(spent)
@@ -356,7 +443,7 @@ class _EstimateSearch:
         uncertainty, most = before.uncertainty, self._count_noise_simulations()
         nothing = np.zeros((theta.size, theta.size))
         covariance = nothing if uncertainty is None else uncertainty.covariance
-        estimate = fit_generalised_least_squares(problem, theta, covariance, self._state.seed, most)
+        estimate = fit_generalised_least_squares(problem, theta, covariance, self.state.seed, most)
         self._budget.spend(estimate.evaluations)
         if any(estimate.correlation_times.values()):
             white = make_whitening(problem, estimate.correlation_times)
@@ -369,7 +456,7 @@ class _EstimateSearch:
 
     def _count_noise_simulations(self) -> int | None:
         """Count the simulations that a noise model may take, by budget and time."""
-        state, left = self._state, self._budget.count_left(self._reserved)
+        state, left = self.state, self._budget.count_left(self._reserved)
         in_time = self._deadline.count_simulations_left(
             state.seconds, state.evaluations, self.problem.n_steps
         )
@@ -406,6 +493,38 @@ class _EstimateSearch:
         agreeing = sum(one.independent for one in minima if one is own or one.rms <= equal)
         all_minima = (*minima, *recorded.minima)
         return FoundMinima(all_minima, agreeing, self._projected, recorded.is_contradicted)
+
+    def follow_profiles(self, theta: FloatArray) -> None:
+        """Replace the intervals around an estimate (D,) that those of a linear model miss."""
+        if self._deadline.is_past_grace():
+            return
+        most = count_affordable_simulations(self.problem, self._deadline.is_over())
+        found = find_profile_ends(self.problem, theta, self.analysis, self._budget.cap(most))
+        self._budget.spend(found.evaluations)
+        ends = {**found.by_name, **self._extrapolate_sets(theta, found, most - found.evaluations)}
+        beyond = {
+            name: self.analysis.minima[name].select_beyond(one.interval)
+            for name, one in ends.items()
+            if name in self.analysis.minima
+        }
+        estimates = compose_intervals(self.analysis.estimates, ends, beyond)
+        self.analysis = replace(self.analysis, estimates=estimates)
+
+    def _extrapolate_sets(
+        self, theta: FloatArray, found: FoundEnds, most: int
+    ) -> dict[str, ProfileEnds]:
+        """Extrapolate the ends of sets of values that fit alike to an infinitely fine step."""
+        sets = {name: ends for name, ends in found.by_name.items() if ends.is_set}
+        if not sets or not can_halve_step(self.problem):
+            return {}
+        most = self._budget.cap(most)
+        half = find_profile_ends(halve_step(self.problem), theta, self.analysis, most, sets)
+        self._budget.spend(half.evaluations)
+        return {
+            name: extrapolate_ends(sets[name], ends)
+            for name, ends in half.by_name.items()
+            if ends.is_set
+        }
 
     def _is_late(self) -> bool:
         """Whether no search may begin: the paper's methods have none."""
@@ -450,14 +569,14 @@ class _EstimateSearch:
         is_doubtful = bool(delays) and self._is_doubtful(end)
         scanned = scan_parameters(problem, start, delays, most, is_late, is_doubtful=is_doubtful)
         fits, spent = [Fit(one.theta, one.rms) for one in scanned.ends[1:]], scanned.evaluations
-        archived = [one for island in self._state.islands for one in read_archive(island.archive)]
+        archived = [one for island in self.state.islands for one in read_archive(island.archive)]
         known = [*ends, *fits]
         continued, count = continue_from_archive(problem, archived, known, most - spent, is_late)
         fits, spent = fits + continued, spent + count
         if is_doubtful:
             most = count_affordable_simulations(problem, self._deadline.is_over(), _MOST_PROJECTED)
             most = self._budget.cap(most, spent, _SCAN_SHARES)
-            projected = scan_by_projection(problem, start, self._state.seed, most, is_late)
+            projected = scan_by_projection(problem, start, self.state.seed, most, is_late)
             fits += [Fit(one.theta, one.rms, 1, 1) for one in projected.ends[1:]]
             spent += projected.evaluations
             self._projected = projected.starts
@@ -465,7 +584,7 @@ class _EstimateSearch:
 
     def _is_doubtful(self, end: IslandEnd) -> bool:
         """Whether the search may have missed the best minimum, a time lag's above all."""
-        restarts = count_restarts(*self._state.champions_and_counters)
+        restarts = count_restarts(*self.state.champions_and_counters)
         share = _ENOUGH_SHARE * restarts.independent
         if restarts.confirmed > share:
             return False
@@ -493,7 +612,7 @@ class _EstimateSearch:
 
     def _search_local_minima(self) -> None:
         """Search the minima near the estimate; move to the best, with intervals that cover all."""
-        problem, state, end = self.problem, self._state, self.ends[self._best]
+        problem, state, end = self.problem, self.state, self.ends[self._best]
         linear = self.analysis.linear_model
         if linear is None:
             return
@@ -519,8 +638,8 @@ class _EstimateSearch:
 
     def _may_jump(self) -> bool:
         """Whether the search met jumps of the loss, or did not probe for them."""
-        searches = [island.search for island in self._state.islands]
-        is_probed = any(one["hop_count"] > 0 for one in searches) and not self._state.is_warm
+        searches = [island.search for island in self.state.islands]
+        is_probed = any(one["hop_count"] > 0 for one in searches) and not self.state.is_warm
         return not is_probed or any(one["fitness_discontinuities"] > 0 for one in searches)
 
     def _move_best(self, reached: IslandEnd, evaluations: int = 0) -> None:
@@ -537,18 +656,20 @@ class _EstimateSearch:
 
     def _widen_intervals(self, minima: LocalMinima) -> None:
         """Widen the intervals so that they contain those of all minima."""
-        linear, problem = self.analysis.linear_model, self.problem
-        if linear is None:
+        linear, likelihood = self.analysis.linear_model, self.analysis.likelihood
+        if linear is None or likelihood is None:
             return
+        problem = self.problem
         values = order_exchangeable(problem, minima.values, self.analysis.exchanges)
-        estimates = widen_intervals(
-            self.analysis.estimates,
-            problem.free_parameters,
+        near = list_compatible_minima(
+            problem.free_names,
             problem.n_scored,
             replace(minima, values=values),
             linear.variance_ratio,
+            likelihood.quantiles,
         )
-        self.analysis = replace(self.analysis, estimates=estimates)
+        estimates = compose_intervals(self.analysis.estimates, near)
+        self.analysis = replace(self.analysis, estimates=estimates, minima=near)
 
     def _count_scan_simulations(self) -> int:
         """Count the simulations that a scan may take."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.core.errors import DivergedEverywhere, NothingIdentifiable
 from sysid.core.jit import read_clock
-from sysid.core.settings import GeneticAlgorithm
+from sysid.core.settings import GeneticAlgorithm, StartKind
 from sysid.core.threads import use_one_thread
 from sysid.data.records import find_common_sample_time
 from sysid.identifiability.exchange import describe_exchanges
@@ -25,6 +25,7 @@ from sysid.judgement.conclusions import (
 )
 from sysid.judgement.determination import find_ambiguous, find_undetermined
 from sysid.judgement.hard_switching import find_hard_switches
+from sysid.judgement.holding_bounds import find_cause_in_bounds
 from sysid.judgement.input_hold import (
     find_hold_doubts,
     find_other_readings,
@@ -35,6 +36,7 @@ from sysid.judgement.integration_step import find_finer_step
 from sysid.judgement.judge import select_explanations
 from sysid.judgement.levels import SOLVER_SHARE
 from sysid.judgement.noise_findings import find_feedback, find_noise_model, find_unexplained
+from sysid.judgement.open_terms import find_open_terms
 from sysid.judgement.preparation import (
     find_early_responses,
     find_few_repeats,
@@ -44,6 +46,7 @@ from sysid.judgement.preparation import (
 from sysid.judgement.process_order import compare_orders, find_other_orders
 from sysid.judgement.residual_context import find_delay_parameters
 from sysid.judgement.settling import find_rough_end, find_unsettled
+from sysid.judgement.starts import StartComparison, find_open_starts
 from sysid.judgement.unrecorded_input import find_unrecorded_input
 from sysid.judgement.unstable_run import (
     compare_one_step,
@@ -82,7 +85,8 @@ def conclude_run(
     the time of the run is limited, refinement ends near the limit and warnings list what was left
     out. Standard errors, tests and validation are always computed. `clock` returns seconds. With
     `posterior` samples of the posterior are taken, as far as budget and time are left. With
-    `orders` a process with dead time is compared with one order more and one less.
+    `orders` a process with dead time is compared with one order more and one less, and intervals
+    follow the profile likelihood where those of the linear model do not hold.
 
     Raises
     ------
@@ -180,7 +184,9 @@ def _build_identification(
         [
             *find_disagreement(metrics, limit, are_residuals_noise=are_noise),
             *find_constant_outputs(problem),
-            *find_unsettled(evidence, estimates),
+            *find_unsettled(
+                evidence, estimates, lambda: find_cause_in_bounds(problem, theta, analysis)
+            ),
             *find_contradictions(problem, metrics, validated, estimates),
             *find_misled_run(estimates, ahead),
             *select_explanations(
@@ -188,9 +194,11 @@ def _build_identification(
                 [
                     *find_other_orders(orders, problem.model.name, estimates),
                     *find_other_readings(problem, holds, doubts, estimates, rms),
+                    *find_open_starts(best.starts, estimates),
                 ],
             ),
             *find_ambiguous(estimates),
+            *find_open_terms(estimates, problem.model),
             *find_undetermined(problem, analysis, delays, are_residuals_noise=are_noise),
             *find_early_responses(problem),
             *find_unrecorded_input(problem, analysis, is_contradicted=minima.is_contradicted),
@@ -246,7 +254,7 @@ def _build_identification(
         ),
         evaluations=state.evaluations + budget.spent,
         generations=max(island.generation for island in state.islands),
-        islands=_summarise_islands(state, best.ends),
+        islands=_summarise_islands(best.state, best.ends),
         identifiability=_describe_identifiability(uncertainty),
         criteria=analysis.criteria,
         correlation=None
@@ -278,8 +286,9 @@ def _build_identification(
         verdict=conclude_verdict(analysis.estimates, findings, declared),
         warnings=list_warnings(findings),
         substeps=problem.model.solver.substeps,
+        initial=_get_start(asked, best.starts),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
-        history=_extend_histories(state, best.ends),
+        history=_extend_histories(best.state, best.ends),
         migrations=state.migrations,
         simulated=split_outputs(problem, simulated),
         simulated_validation=() if validated is None else validated.simulated,
@@ -291,6 +300,14 @@ def _describe_identifiability(uncertainty: Uncertainty | None) -> Identifiabilit
     if uncertainty is None:
         return Identifiability(None, (), np.zeros(0))
     return Identifiability(uncertainty.condition, uncertainty.groups, uncertainty.singular_values)
+
+
+def _get_start(asked: Problem, starts: StartComparison | None) -> StartKind | None:
+    """Get the start that the estimates assume; None for that of the model's document."""
+    if starts is not None:
+        return starts.own.name
+    initial = asked.settings.initial
+    return None if initial == "auto" else initial
 
 
 def _compute_input_history(problem: Problem) -> tuple[float, ...]:

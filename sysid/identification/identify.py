@@ -72,6 +72,10 @@ def identify(request: IdentificationRequest) -> Identification:
         residual counts by the variance that the noise has in its output and its experiment.
     skip : int
         Number of first samples of each output that are not compared.
+    initial : {"rest", "free", "measured", "auto"}
+        Where the states start: at rest under the first inputs, at estimated or at measured values.
+        ``"auto"`` compares them by the data. Default: as the model's document says, which is
+        ``auto`` for processes with dead time.
     validation : Record, Recording, table, or sequence of them
         Data that are not used for the estimate.
     validation_fraction : float
@@ -125,7 +129,14 @@ def identify(request: IdentificationRequest) -> Identification:
         model,
         read.records,
         request.settings or GeneticAlgorithm(),
-        FitSettings(changes, request.prediction, loss, request.weights, request.skip),
+        FitSettings(
+            changes,
+            request.prediction,
+            loss,
+            request.weights,
+            request.skip,
+            request.initial,
+        ),
         request,
         validation=(
             None

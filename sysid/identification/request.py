@@ -10,7 +10,14 @@ from numbers import Integral, Real
 from typing import Any, ParamSpec, TypeVar, get_type_hints
 
 from sysid.core.errors import InvalidSettings
-from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, PredictionKind, Weights
+from sysid.core.settings import (
+    FitSettings,
+    GeneticAlgorithm,
+    InitialSetting,
+    Loss,
+    PredictionKind,
+    Weights,
+)
 from sysid.data.foreign_tables import describe_value
 from sysid.data.holds import HoldSetting
 from sysid.data.noise import Noise
@@ -42,6 +49,7 @@ class IdentificationRequest(RunOptions):
     loss: Loss | None = None
     weights: Weights | None = _FIT.weights
     skip: int = _FIT.skip
+    initial: InitialSetting | None = _FIT.initial
     validation: Data | Sequence[Data] | None = None
     progress: Callable[[RunState], None] | None = None
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.core.errors import InvalidSettings
-from sysid.core.settings import FitSettings
+from sysid.core.settings import FitSettings, InitialSetting
 from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
 from sysid.identification.fit_problems import FitRecords, build_problems
@@ -32,6 +32,7 @@ def resimulate_run(
     settings: FitSettings,
     estimates: Sequence[Estimate],
     substeps: int,
+    initial: InitialSetting | None = None,
 ) -> FittedSignals:
     """Simulate the outputs of a run again, bit for bit as the run did.
 
@@ -43,6 +44,8 @@ def resimulate_run(
         Of the run; bounds and values count.
     substeps : int
         Integration steps in a sample of the result.
+    initial : {"rest", "free", "measured"} or None
+        Start that the estimates assume; None: as the settings say.
 
     Raises
     ------
@@ -52,7 +55,9 @@ def resimulate_run(
     with use_one_thread():
         problem, validation = build_problems(model, records, settings)
         if substeps != problem.model.solver.substeps:
-            problem = problem.rebuild(model=replace_substeps(problem.untied_model, substeps))
+            problem = problem.rebuild(model=replace_substeps(problem.given_model, substeps))
+        if initial is not None:
+            problem = problem.rebuild(initial=initial)
         values = {estimate.name: estimate.value for estimate in estimates}
         missing = [name for name in problem.free_names if name not in values]
         if missing:

@@ -6,8 +6,9 @@ process with dead time, however it is written (`sysid.control.process_form`), is
 neighbours in the catalogue (`sysid.models.catalogue.process_family`).
 
 All orders are fitted to the same samples under the same assumptions, also the model's own: the
-entry of the catalogue, with free initial states and one integration step. Least squares starts from
-the estimate. A dead time that grows by the time constant that is left out keeps the sum of all.
+entry of the catalogue, at rest if the model is, else with free initial states, and one integration
+step. Least squares starts from the estimate. A dead time that grows by the time constant that is
+left out keeps the sum of all.
 
 The criterion is Schwarz's (BIC, 1978). If the residuals of the highest order are not white, or the
 estimate has a noise model, each order has first-order noise of its own, with the correlation time
@@ -25,23 +26,23 @@ import numpy as np
 from sysid.control.linear_form import IdentifiedModel
 from sysid.control.process_form import recognise_process
 from sysid.core.errors import SysidError
-from sysid.core.settings import FitSettings, Loss
+from sysid.core.settings import FitSettings, Loss, StartKind
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
+from sysid.judgement.judge import explain_residuals
 from sysid.judgement.levels import SEPARABLE
-from sysid.judgement.residual_context import find_delay_parameters
+from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
 from sysid.models.catalogue.load import load_model
 from sysid.models.catalogue.process_family import Process, ProcessEntry, list_neighbouring_orders
 from sysid.models.model import name_initial_state, replace_substeps
-from sysid.noise_models.generalised_least_squares import WhitenedLeastSquares
-from sysid.residuals.series import is_coloured, iterate_parts, make_whitening
-from sysid.residuals.whitening import Whitening
+from sysid.noise_models.first_order_fit import fit_first_order_noise
+from sysid.residuals.series import is_coloured, iterate_parts
 from sysid.results.findings import Finding, Move
 from sysid.results.parts import OrderComparison, OrderFit, compare_fits
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import from_unit, to_unit
+from sysid.simulation.start_values import starts_at_rest
 from sysid.uncertainty.analysis import analyse_estimate, compute_criteria
 from sysid.uncertainty.estimates import Estimate
 
@@ -50,8 +51,6 @@ _NEGLIGIBLE_SHARE = 1e-3  # of the output: smaller residuals are of the integrat
 _NEW_PARTS = (0.1, 0.4, 1.0)  # of the slowest time constant: starts of the part that is added
 _MOVE = 1e-3  # of a parameter, relative: what it changes in the process
 _MAX_SIMULATIONS = 4000  # of an order: half for the fit, the rest for noise model and errors
-_ROUNDS = 2  # of least squares and correlation time, in turn
-_SHORTEST_TIME, _LONGEST_TIME = 0.1, 0.5  # correlation time, of a sampling period and the record
 
 
 class _Assumptions(NamedTuple):
@@ -65,11 +64,14 @@ class _Assumptions(NamedTuple):
         Of the dead time.
     fixed : frozenset of {"gain", "offset"}
         What no free parameter of the model changes.
+    initial : {"rest", "free"}
+        Where the states start.
     """
 
     process: Process
     delay: Estimate
     fixed: frozenset[str]
+    initial: StartKind
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,10 +120,11 @@ def compare_orders(
     if len(fits) < 2:
         return None, spent
     has_colour = problem.loss.noise_model == "ar1" or _has_coloured_residuals(fits[-1])
-    compared, bounded = list[OrderFit](), set[str]()
+    compared, contexts, bounded = list[OrderFit](), dict[str, ResidualContext](), set[str]()
     for fitted in fits:
-        order, is_bounded, simulations = _assess_order(fitted, has_colour=has_colour)
+        order, context, is_bounded, simulations = _assess_order(fitted, has_colour=has_colour)
         compared.append(order)
+        contexts[order.model] = context
         bounded |= {order.model} if is_bounded else set()
         spent += simulations
     own = next(
@@ -135,19 +138,39 @@ def compare_orders(
         assumptions.delay.unit,
         "ar1" if has_colour else "white",
         compared,
+        problem.n_scored,
     )
     if bounded & {own, comparison.preferred_model}:
         return None, spent
+    preferred = comparison.preferred_model
+    if preferred is not None and preferred != own:
+        context = contexts[preferred]
+        comparison = _judge_fit(comparison, preferred, context)
+        spent += len(context.spent)
     return comparison, spent
+
+
+def _judge_fit(
+    comparison: OrderComparison, model: str, context: ResidualContext
+) -> OrderComparison:
+    """Judge whether nothing but noise is left by the fit of a model."""
+    leaves_noise = explain_residuals(context).is_noise
+    fits = tuple(
+        replace(fit, leaves_noise=leaves_noise) if fit.model == model else fit
+        for fit in comparison.fits
+    )
+    return replace(comparison, fits=fits)
 
 
 def find_other_orders(
     comparison: OrderComparison | None, model: str, estimates: Sequence[Estimate]
 ) -> Iterator[Finding]:
-    """Find orders that the data prefer, or do not rule out, and that move the dead time.
+    """Find orders that the data prefer, or find as likely, and that move the dead time.
 
-    Orders that are open move it by more than its interval. `model` is the name of the model that
-    was identified.
+    An order that was chosen by one who knows the plant has the odds that would exclude another
+    (`STRONG_ODDS`). So others count if they are as likely by the data. They move the dead time by
+    more than its interval. Another order is advised if nothing but noise is left by it. `model` is
+    the name of the model that was identified.
     """
     if comparison is None or comparison.preferred_model == comparison.model:
         return
@@ -155,7 +178,7 @@ def find_other_orders(
     estimate = next(one for one in estimates if one.name == name)
     others = [fit for fit in comparison.open_fits if fit.model != own.model]
     best = min(others, key=lambda fit: fit.bic)
-    moved = [fit for fit in others if _is_moved(fit, own)]
+    moved = [fit for fit in others if _is_moved(fit, own) and fit.bic < own.bic]
     if comparison.preferred_model is None and not moved:
         return
     listed = ", ".join(_write_delay(comparison, fit) for fit in (own, *others))
@@ -171,7 +194,7 @@ def find_other_orders(
             f"{own.order}): its BIC is {own.bic - best.bic:.3g} lower. {name} is {listed}."
         )
         cure = "Give your model as many time constants, or use" if model != own.model else "Use"
-        advice = f"{cure} the model {best.model}."
+        advice = f"{cure} the model {best.model}." if best.leaves_noise else ""
     yield Finding(
         "order",
         "structure",
@@ -223,7 +246,8 @@ def _read_assumptions(
         changed |= {
             part for part in ("gain", "offset") if getattr(other, part) != getattr(process, part)
         }
-    return _Assumptions(process, delay, frozenset({"gain", "offset"} - changed))
+    initial: StartKind = "rest" if starts_at_rest(problem, theta) else "free"
+    return _Assumptions(process, delay, frozenset({"gain", "offset"} - changed), initial)
 
 
 def _changes_dynamics(process: Process, other: Process) -> bool:
@@ -285,6 +309,7 @@ def _build_problem(problem: Problem, entry: ProcessEntry, assumptions: _Assumpti
         loss=Loss(noise_model="white"),
         weights={model.outputs[0].name: next(iter(problem.output_weights.values()))},
         skip=problem.settings.skip,
+        initial=assumptions.initial,
         scored_from=problem.settings.scored_from,
         deviations=problem.settings.deviations,
     )
@@ -330,11 +355,13 @@ def _has_coloured_residuals(fitted: _FittedOrder) -> bool:
     return any(is_coloured(part, residuals[part.rows]) for part in iterate_parts(fitted.problem))
 
 
-def _assess_order(fitted: _FittedOrder, *, has_colour: bool) -> tuple[OrderFit, bool, int]:
+def _assess_order(
+    fitted: _FittedOrder, *, has_colour: bool
+) -> tuple[OrderFit, ResidualContext, bool, int]:
     """Compute the BIC of a fitted order, its dead time, and whether that is at its bound."""
     problem, theta, spent, whitening = fitted.problem, fitted.theta, fitted.evaluations, None
     if has_colour:
-        theta, whitening, simulations = _fit_coloured_noise(fitted)
+        theta, whitening, simulations = fit_first_order_noise(problem, theta)
         spent += simulations
     residuals = problem.compute_residuals(theta[None])[0]
     analysis = analyse_estimate(problem, theta, whitening=whitening)
@@ -351,37 +378,5 @@ def _assess_order(fitted: _FittedOrder, *, has_colour: bool) -> tuple[OrderFit, 
         float(np.sqrt(np.mean(np.square(residuals)))),
         criteria.bic,
     )
-    return order, delay.status == "at bound", spent + analysis.evaluations + 1
-
-
-def _fit_coloured_noise(fitted: _FittedOrder) -> tuple[FloatArray, Whitening, int]:
-    """Estimate under first-order noise whose correlation time has the largest likelihood."""
-    problem, theta, search = fitted.problem, fitted.theta, WhitenedLeastSquares(fitted.problem)
-    whitening = _fit_correlation_time(problem, problem.compute_residuals(theta[None])[0])
-    for _ in range(_ROUNDS):
-        point = search.find_lowest_minimum([to_unit(problem.evaluator, theta[None])[0]], whitening)
-        theta = from_unit(problem.evaluator, point[None])[0]
-        whitening = _fit_correlation_time(problem, problem.compute_residuals(theta[None])[0])
-    return theta, whitening, search.evaluations + _ROUNDS
-
-
-def _fit_correlation_time(problem: Problem, residuals: FloatArray) -> Whitening:
-    """Find the whitening of largest likelihood for residuals (n,)."""
-    from scipy.optimize import minimize_scalar  # imported late: slow to load, rarely needed
-
-    [output] = problem.model.outputs
-    # Pooled repeats have several samples at a time.
-    distinct = [np.unique(part.times) for part in iterate_parts(problem)]
-    spans = [times for times in distinct if times.size > 1]
-    if not spans:
-        return make_whitening(problem, {})
-    shortest = min(float(np.median(np.diff(times))) for times in spans)
-    longest = max(float(np.ptp(times)) for times in spans)
-
-    def compute_bic(logarithm: float) -> float:
-        whitening = make_whitening(problem, {output.name: float(np.exp(logarithm))})
-        return compute_criteria(problem, whitening.whiten(residuals), whitening).bic
-
-    bounds = (np.log(_SHORTEST_TIME * shortest), np.log(_LONGEST_TIME * longest))
-    best = minimize_scalar(compute_bic, bounds=bounds, method="bounded", options={"xatol": 0.01})
-    return make_whitening(problem, {output.name: float(np.exp(best.x))})
+    context = ResidualContext(problem, theta, analysis)
+    return order, context, delay.status == "at bound", spent + analysis.evaluations + 1

@@ -12,8 +12,8 @@ from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.core.units import format_unit
 from sysid.data.interpolation import interpolate_channel
 from sysid.data.records import Channel, Record
-from sysid.judgement.fixed_start import compute_start_slopes, list_fixed_starts
 from sysid.judgement.residual_model import ColumnFit, Noise, ResidualModel
+from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.kernels.signals.past_reads import list_delayed_values
 from sysid.models.model import Model
 from sysid.models.ties import collect_parameter_names
@@ -24,7 +24,7 @@ from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale
 from sysid.uncertainty.sensitivities import compute_sensitivities
 
-_EDGE_SHARE = 0.05  # of an experiment at either end, in which no change is looked for
+_EDGE_SHARE = 0.1  # of an experiment at either end, in which no change is looked for
 _REFIT_STEPS = 12  # of least squares, from the estimate
 _AFTER = 0.01  # of a period: a held input has jumped then
 _MOST_STATES = 8  # whose starts are looked at
@@ -55,6 +55,8 @@ class Candidate:
         Records with which the model is fitted again, for moves that are not linear.
     is_vague : bool
         Whether it leaves open what the model lacks: then no parameter is safe.
+    is_added : bool
+        Whether it adds to the output whatever the parameters are, such as a drift of the sensor.
     """
 
     explanation: str
@@ -69,6 +71,7 @@ class Candidate:
     moment: float | None = None
     records: Sequence[Record] | None = None
     is_vague: bool = False
+    is_added: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,28 +151,32 @@ class ResidualContext:
         return self.weight[:, None] * columns
 
     def compute_moves(
-        self, fit: ColumnFit, base: ColumnFit, varies: tuple[int, float, float] | None = None
+        self,
+        fit: ColumnFit,
+        before: ColumnFit | None = None,
+        varies: tuple[int, float, float] | None = None,
     ) -> tuple[Move, ...]:
-        """Compute how far a fit moves the parameters from another one, the furthest first.
+        """Compute how far a fit moves the parameters, the furthest first.
 
-        A parameter that varies moves to that of its values that is furthest.
+        They move from the estimate, or from the fit `before` to which an explanation is added. A
+        parameter that varies moves to that of its values that is furthest.
         """
         d = self.theta.size
         scale = compute_physical_scale(self.problem, self.theta)
-        steps = (fit.coefficients[:d] - base.coefficients[:d]) * scale
-        errors = fit.errors[:d] * scale
+        moved, errors = fit.coefficients[:d] * scale, fit.errors[:d] * scale
+        start = np.zeros(d) if before is None else before.coefficients[:d] * scale
         if varies is not None:
             number, *shares = varies
             change = float(fit.coefficients[-1] * scale[number])
-            ends = [float(steps[number]) + share * change for share in shares]
-            steps[number] = max(ends, key=abs)
+            ends = [float(moved[number]) + share * change for share in shares]
+            moved[number] = max(ends, key=lambda end: abs(end - start[number]))
         known = {estimate.name: estimate for estimate in self.analysis.estimates}
         return _order_moves(
             Move(
                 name,
-                float(self.theta[number] + steps[number]),
+                float(self.theta[number] + moved[number]),
                 float(errors[number]),
-                float(steps[number] / stderr),
+                float(moved[number] - start[number]) / stderr,
             )
             for number, name in self.declared
             if (stderr := known[name].stderr)
@@ -304,7 +311,7 @@ class ResidualContext:
 
         Not of predictions one step ahead, which forget their start.
         """
-        states = list_fixed_starts(self.problem)
+        states = list_assumed_starts(self.problem)
         if self.problem.prediction != "simulation" or len(states) > _MOST_STATES:
             return []
         noise = float(np.sqrt(np.mean(np.square(self.residual_model.residuals))))

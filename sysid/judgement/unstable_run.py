@@ -24,9 +24,9 @@ import numpy as np
 
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
-from sysid.judgement.fixed_start import compute_start_slopes, list_fixed_starts
 from sysid.judgement.input_hold import replace_holds, write_hold
 from sysid.judgement.residual_context import find_delay_parameters
+from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.minima.minima import scan_parameters
 from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.series import is_coloured, iterate_parts
@@ -147,7 +147,7 @@ def compute_growth(problem: Problem, theta: FloatArray) -> float:
     noise = float(np.sqrt(np.mean(np.square(sensitivities.residuals))))
     declared = {parameter.name for parameter in problem.model.parameters}
     starts = [name not in declared for name in problem.free_names]
-    assumed = list_fixed_starts(problem)
+    assumed = list_assumed_starts(problem)
     slopes = [compute_start_slopes(problem, theta, one, noise) for one in assumed]
     effects, growth = np.hstack([sensitivities.columns[:, starts], *slopes]), 1.0
     for part in iterate_parts(problem):

@@ -83,11 +83,14 @@ def simulate_validation(
     """Simulate validation data with all estimates fixed, as `validate_estimates` says."""
     model, changes = validation.untied_model, validation.settings.parameters
     is_part = validation.settings.scored_from is not None
+    # Other records may start otherwise, if the data were to tell how the fitted ones start.
+    initial = (estimation if is_part else validation).settings.initial
     shared = {p.name for p in (validation.all_parameters if is_part else model.parameters)}
     fixed = {e.name: _to_fixed_parameter(e) for e in estimates if e.name in shared}
     other_changes = {name: fields for name, fields in changes.items() if name not in shared}
     fixed_problem = validation.rebuild(
-        model=estimation.untied_model,
+        model=estimation.given_model,
+        initial=initial,
         parameters={**other_changes, **fixed},
         weights=estimation.output_weights,
     )

@@ -12,6 +12,7 @@ from sysid.models.model import (
     Output,
 )
 from sysid.models.parameters import Parameter
+from sysid.models.sections import AUTO
 
 _TEXT_FIELDS = ("description", "source")
 
@@ -47,10 +48,7 @@ def to_normal_form(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
         },
         "constants": {k: float(v) for k, v in (fields.get("constants") or {}).items()},
         **_write_histories(fields.get("history"), model),
-        "initial": {
-            state.name: _write_initial_state(start)
-            for state, start in zip(model.states, model.initial, strict=True)
-        },
+        "initial": AUTO if fields.get("initial") == AUTO else write_starts(model),
         "solver": _write_solver(model),
     }
 
@@ -133,6 +131,12 @@ def _write_parameter(parameter: Parameter, declared: Mapping[str, Any]) -> dict[
     if description := declared[parameter.name].get("description"):
         entry["description"] = " ".join(description.split())
     return entry
+
+
+def write_starts(model: Model) -> dict[str, object]:
+    """Write the starts of a model's states as its document has them."""
+    pairs = zip(model.states, model.initial, strict=True)
+    return {state.name: _write_initial_state(start) for state, start in pairs}
 
 
 def _write_initial_state(start: InitialState) -> object:

@@ -120,7 +120,10 @@ def _check_size(reader: DocumentReader, model: Model) -> None:
 
 
 def _check_bounds_rules(reader: DocumentReader, model: Model) -> None:
-    """Check that bounds follow the data only where gains and times are those of a plant."""
+    """Check that bounds follow the data only where gains and times are those of a plant.
+
+    A state is of the size of the outputs in a recursion too.
+    """
     if model.form == "differential":
         return
     starts = zip(model.states, model.initial, strict=True)
@@ -130,7 +133,7 @@ def _check_bounds_rules(reader: DocumentReader, model: Model) -> None:
     pointers += [
         join_pointer("initial", state.name)
         for state, start in starts
-        if isinstance(start, EstimatedInitial) and start.bounds is not None
+        if isinstance(start, EstimatedInitial) and start.bounds not in (None, "state")
     ]
     for pointer in pointers:
         reader.add_fault(pointer + "/bounds", "belongs to the differential form; give numbers")
@@ -279,6 +282,21 @@ def _check_output_names(reader: DocumentReader, outputs: tuple[Output, ...], sco
             )
 
 
+def find_measured_states(
+    states: Sequence[str],
+    trees: Sequence[Expression],
+    outputs: Sequence[Output],
+    *,
+    is_rate: bool,
+) -> set[str]:
+    """Find the states that an output measures, or whose integral it measures."""
+    measured = {name for o in outputs if (name := match_plain_state(o.expression))}
+    if is_rate:
+        rates = (trees[states.index(name)] for name in tuple(measured))
+        measured |= {name for tree in rates if (name := match_plain_state(tree))}
+    return measured
+
+
 def _check_measured_starts(
     reader: DocumentReader,
     starts: tuple[InitialState, ...],
@@ -287,10 +305,9 @@ def _check_measured_starts(
     scope: Scope,
 ) -> None:
     """Check that a measured initial state has an output that is that state or its integral."""
-    measured = {name for o in outputs if (name := match_plain_state(o.expression))}
-    if scope.form == "differential":
-        rates = (trees[scope.states.index(name)] for name in tuple(measured))
-        measured |= {name for tree in rates if (name := match_plain_state(tree))}
+    measured = find_measured_states(
+        scope.states, trees, outputs, is_rate=scope.form == "differential"
+    )
     for name, start in zip(scope.states, starts, strict=True):
         if isinstance(start, MeasuredInitial) and name not in measured:
             detail = (

@@ -71,20 +71,49 @@ def solve_rest(
         If the equations do not determine these states, or are not linear in them.
     """
     solver = _RestSolver(tuple(equations), intervals)
+    return solver.solve(_write_rows(equations, starts, is_rate=is_rate))
+
+
+def solve_standstill(
+    equations: Mapping[str, Expression],
+    intervals: Mapping[str, tuple[float, float]],
+    *,
+    is_rate: bool,
+) -> dict[str, Expression]:
+    """Solve for the states that a rest determines, whatever the level of an integrator is.
+
+    An integrator may rest at any level, so its state is left out. So is a state whose rest depends
+    on such a level. The arguments are those of `solve_rest`.
+
+    Raises
+    ------
+    NoRestError
+        If the equations are not linear in the states, or change with time.
+    """
+    solver = _RestSolver(tuple(equations), intervals, has_levels=True)
+    solved = solver.solve(_write_rows(equations, {}, is_rate=is_rate))
+    return {name: tree for name, tree in solved.items() if not _reads_state(tree)}
+
+
+def _write_rows(
+    equations: Mapping[str, Expression], starts: Mapping[str, Expression], *, is_rate: bool
+) -> dict[str, Expression]:
+    """Write the equations as rows that are zero at rest."""
     held = {name: _hold_signals(tree, starts) for name, tree in equations.items()}
-    rows = {
+    return {
         name: _drop_divisor(tree) if is_rate else Binary("-", tree, PastValue(name, "state"))
         for name, tree in held.items()
     }
-    return solver.solve(rows)
+
+
+def _reads_state(tree: Expression) -> bool:
+    return any(isinstance(node, PastValue) and node.kind == "state" for node in walk(tree))
 
 
 def _drop_divisor(tree: Expression) -> Expression:
     """Drop a divisor without states: it does not change where a rate is zero."""
     match tree:
-        case Binary("/", above, below) if not any(
-            isinstance(node, PastValue) and node.kind == "state" for node in walk(below)
-        ):
+        case Binary("/", above, below) if not _reads_state(below):
             return _drop_divisor(above)
         case _:
             return tree
@@ -108,12 +137,19 @@ def _hold_signals(tree: Expression, starts: Mapping[str, Expression]) -> Express
 
 
 class _RestSolver:
-    """Solver for unknown states by substitution and elimination."""
+    """Solver for unknown states by substitution and elimination.
+
+    With `has_levels`, states that no row determines stay open.
+    """
 
     def __init__(
-        self, names: tuple[str, ...], intervals: Mapping[str, tuple[float, float]]
+        self,
+        names: tuple[str, ...],
+        intervals: Mapping[str, tuple[float, float]],
+        *,
+        has_levels: bool = False,
     ) -> None:
-        self._names = names
+        self._names, self._has_levels = names, has_levels
         self._nodes = 0
         self._points = [
             {
@@ -177,6 +213,8 @@ class _RestSolver:
             reduced = affine
             for name, value in solved.items():
                 reduced = self._insert(reduced, name, value)
+            if not reduced.factors and self._has_levels:
+                continue
             if not reduced.factors:
                 raise NoRestError(
                     f"the equation of {row} does not determine it at rest, as of an integrator"
@@ -193,7 +231,14 @@ class _RestSolver:
             )
             solved = {other: self._insert(old, name, value) for other, old in solved.items()}
             solved[name] = value
-        return {name: value.constant for name, value in solved.items()}
+        return {name: self._join(value) for name, value in solved.items()}
+
+    def _join(self, value: _Affine) -> Expression:
+        """Join a constant and the parts of states that stay open."""
+        total = value.constant
+        for name, factor in value.factors.items():
+            total = self._sum(total, _multiply(factor, PastValue(name, "state")))
+        return total
 
     def _insert(self, affine: _Affine, name: str, value: _Affine) -> _Affine:
         """Insert the value of a state."""

@@ -30,8 +30,14 @@ from sysid.models.parameters import BoundsRule, Parameter, ParameterScale
 STEADY = "steady"
 """A start at which the equations rest with the inputs' first values."""
 
+AUTO = "auto"
+"""Starts that the document leaves open: they are estimated, and compared with a rest."""
+
 HISTORY = "history"
 """A start at which the history function of the state ends."""
+
+OPEN_START = EstimatedInitial(-10.0, 10.0, "state")
+"""Estimated start whose bounds follow the data; without data they are these."""
 
 MAX_EQUATIONS = 64
 MAX_PARAMETERS = 256
@@ -160,9 +166,13 @@ def read_initial_states(
     is the default of a state `with_history`.
     """
     states = scope.states
-    fields = (
-        dict.fromkeys(states, STEADY) if value == STEADY else reader.read_section(value, "/initial")
-    )
+    if value == AUTO:
+        fields: Mapping[str, Any] = {}
+        default = OPEN_START if scope.form == "differential" else default
+    elif value == STEADY:
+        fields = dict.fromkeys(states, STEADY)
+    else:
+        fields = reader.read_section(value, "/initial")
     for name in fields:
         if name not in states:
             reader.add_fault(

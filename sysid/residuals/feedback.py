@@ -41,13 +41,11 @@ _MAX_SAMPLES = 5_000
 _SAMPLES_PER_COEFFICIENT = 4  # least number for each coefficient
 
 
-def describe_feedback(
-    series: Iterable[ResidualSeries], *, advises_noise_model: bool = False
-) -> list[str]:
+def describe_feedback(series: Iterable[ResidualSeries]) -> list[str]:
     """Describe inputs that follow the residuals of an output, each pair once."""
     return [
         f"input {name!r} follows the residuals of {output}: they explain {100 * share:.0f} % "
-        f"of what its past does not. {_describe_causes(channel, advises_noise_model)}"
+        f"of what its past does not. {_describe_causes(channel)}"
         for (name, output), (share, channel) in _compute_shares(series).items()
         if share > _CLEAR_SHARE
     ]
@@ -79,17 +77,14 @@ def _compute_shares(
     return shares
 
 
-def _describe_causes(channel: Channel, advises_noise_model: bool) -> str:
+def _describe_causes(channel: Channel) -> str:
     """Describe the possible causes: feedback, or dynamics that the model misses."""
-    is_held = channel.effective_hold == "zero"
-    # A noise model does not replace missing dynamics, which can be the cause otherwise.
-    advice = " and use loss: {noise_model: ar1}" if advises_noise_model and is_held else ""
     loop = (
         "In a closed loop noise drives the input. The estimates are then biased towards minus the "
         "inverse of the controller, and standard errors do not show it. Excite the loop by the "
-        f"reference{advice}, or identify in open loop. "
+        "reference, or identify in open loop. "
     )
-    if is_held:
+    if channel.effective_hold == "zero":
         return (
             f"{loop}If there is no controller, the output responds at once and the model does not"
         )

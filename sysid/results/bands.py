@@ -12,6 +12,7 @@ from sysid.core.settings import PredictionKind
 from sysid.data.records import Channels, Record, Recording
 from sysid.models.model import Model, name_initial_state, replace_substeps
 from sysid.models.parse import keep_terms
+from sysid.models.starts import replace_starts
 from sysid.results.result import FullResult
 from sysid.simulation.fit_metrics import ChannelMetrics
 from sysid.simulation.problem import Problem
@@ -74,6 +75,7 @@ def compute_record_bands(
         model = keep_terms(model, [term.term for term in found.selection])
     if found.substeps != model.solver.substeps:
         model = replace_substeps(model, found.substeps)
+    model = replace_starts(model, found.initial)
     return compute_fit_bands(
         model,
         list_whole_records(data.records, data.validation if data.is_part else ()),

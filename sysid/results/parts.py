@@ -2,15 +2,18 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import log
 from typing import Literal
 
 import numpy as np
 
+from sysid.core.distributions import chi_square_limit
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 
 STRONG_EVIDENCE = 6.0
 """Difference of BIC: odds of 20 to 1 (Kass and Raftery 1995)."""
+_CHANCE = 0.05  # of a gain of the likelihood by more parameters alone (Wilks 1938)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +129,8 @@ class OrderFit:
         Criterion of Schwarz, smaller is better; with the noise model of the comparison.
     is_open : bool
         Whether its BIC is within 6 of the lowest: no strong evidence against it.
+    leaves_noise : bool
+        Whether nothing but noise is left by it. Only of the preferred order this is looked for.
     """
 
     model: str
@@ -136,6 +141,7 @@ class OrderFit:
     rms: float
     bic: float
     is_open: bool = True
+    leaves_noise: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,25 +185,37 @@ class OrderComparison:
         return tuple(fit for fit in self.fits if fit.is_open)
 
 
+def _is_open(fit: OrderFit, best: OrderFit, samples: int) -> bool:
+    """Whether the data do not rule out an order, and speak for the parameters that it has more."""
+    more = len(fit.values) - len(best.values)
+    gain = best.bic - fit.bic + more * log(samples)
+    if more > 0 and gain <= chi_square_limit(more, _CHANCE):
+        return False
+    return fit.bic <= best.bic + STRONG_EVIDENCE
+
+
 def compare_fits(
     model: str,
     delay: str,
     unit: str,
     noise_model: Literal["white", "ar1"],
     fits: Sequence[OrderFit],
+    samples: int,
 ) -> OrderComparison:
-    """Compare fitted orders by their BIC: which are open, and which one is preferred.
+    """Compare orders fitted to so many samples by their BIC: which are open, which is preferred.
+
+    One with more parameters than the best is open only if its likelihood gains more than by chance.
 
     Examples
     --------
     >>> first = OrderFit("fopdt", 1, 1.57, 0.01, {"L": 1.57}, 0.027, -1264.0)
     >>> second = OrderFit("sopdt", 2, 1.33, 0.01, {"L": 1.33}, 0.019, -1474.0)
-    >>> comparison = compare_fits("fopdt", "L", "s", "white", (first, second))
+    >>> comparison = compare_fits("fopdt", "L", "s", "white", (first, second), 300)
     >>> comparison.preferred_model, comparison.delay_range
     ('sopdt', (1.33, 1.33))
     """
-    limit = min(fit.bic for fit in fits) + STRONG_EVIDENCE
-    judged = tuple(replace(fit, is_open=fit.bic <= limit) for fit in fits)
+    best = min(fits, key=lambda fit: fit.bic)
+    judged = tuple(replace(fit, is_open=_is_open(fit, best, samples)) for fit in fits)
     open_fits = [fit for fit in judged if fit.is_open]
     delays = [fit.delay for fit in open_fits]
     preferred = open_fits[0].model if len(open_fits) == 1 else None

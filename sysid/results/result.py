@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from sysid.core.errors import InvalidRecord
-from sysid.core.settings import LossKind, PredictionKind
+from sysid.core.settings import LossKind, PredictionKind, StartKind
 from sysid.core.text import find_rms_unit
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
@@ -176,6 +176,8 @@ class Result:
         Integration steps in one grid step: the model's, or more.
     selection : tuple of SelectedTerm
         Selected terms; empty if none were to be selected.
+    initial : StartKind or None
+        Start of the states that the estimates assume; none: as the model's document says.
     """
 
     valid: bool
@@ -210,6 +212,7 @@ class Result:
     warnings: tuple[str, ...]
     substeps: int
     selection: tuple[SelectedTerm, ...]
+    initial: StartKind | None = None
 
     @property
     def parameter_values(self) -> dict[str, float]:

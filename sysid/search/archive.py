@@ -5,6 +5,7 @@ that begin near the champion return to it, and show nothing. A full archive forg
 minimum for a better one.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +39,17 @@ def read_archive(archive: FloatArray) -> list[ArchivedMinimum]:
         ArchivedMinimum(row[_POINT:], int(row[_COUNT]))
         for row in archive[np.isfinite(archive[:, _FITNESS])]
     ]
+
+
+def convert_archive(
+    archive: FloatArray, convert: Callable[[FloatArray], FloatArray], n: int
+) -> FloatArray:
+    """Convert the points of an archive to n other coordinates; empty rows stay empty."""
+    converted = make_archive(n)
+    converted[:, :_POINT] = archive[:, :_POINT]
+    for row in np.flatnonzero(np.isfinite(archive[:, _FITNESS])):
+        converted[row, _POINT:] = convert(archive[row, _POINT:])
+    return converted
 
 
 @jit_compile

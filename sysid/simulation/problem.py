@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from sysid.core.errors import InvalidRecord, InvalidSettings
-from sysid.core.settings import FitSettings, Loss, PredictionKind, Weights
+from sysid.core.settings import FitSettings, InitialSetting, Loss, PredictionKind, Weights
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import Record
 from sysid.kernels.compilation.build import get_kernel_address
@@ -18,6 +18,7 @@ from sysid.kernels.signals.past_reads import list_delaying_inputs
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.model_delays import check_delays
 from sysid.models.parameters import Parameter, override_parameters
+from sysid.models.starts import replace_starts
 from sysid.models.ties import Ties, apply_ties, resolve_ties
 from sysid.simulation.data_bounds import add_units_of_data, bound_by_data
 from sysid.simulation.evaluator import Evaluator, evaluate_population, predict_population
@@ -60,8 +61,8 @@ class Problem:
     ----------
     model : Model
         With tied parameters replaced by their expressions.
-    untied_model : Model
-        The model before the ties were replaced.
+    given_model : Model
+        The model as it was given: before its starts were replaced, and its ties.
     records : tuple of Record
     settings : FitSettings
     all_parameters : tuple of Parameter
@@ -89,7 +90,7 @@ class Problem:
     """
 
     model: Model
-    untied_model: Model
+    given_model: Model
     records: tuple[Record, ...]
     settings: FitSettings
     all_parameters: tuple[Parameter, ...]
@@ -112,12 +113,13 @@ class Problem:
         loss: Loss | None = None,
         weights: Weights | None = None,
         skip: int = 0,
+        initial: InitialSetting | None = None,
         scored_from: Sequence[float] | None = None,
     ) -> "Problem":
         """Build a problem from the fields of `FitSettings`; raises as `from_settings` does."""
         scoring_starts = None if scored_from is None else tuple(scored_from)
         settings = FitSettings(
-            parameters or {}, prediction, loss or Loss(), weights, skip, scoring_starts
+            parameters or {}, prediction, loss or Loss(), weights, skip, initial, scoring_starts
         )
         return cls.from_settings(model, records, settings)
 
@@ -151,6 +153,7 @@ class Problem:
                 "/scored_from",
                 f"found {len(scoring_starts)} times for {len(records)} records. Need one each",
             )
+        given, model = model, replace_starts(model, settings.initial)
         declared = (*model.parameters, *build_initial_parameters(model, len(records)))
         bounded = bound_by_data(add_units_of_data(declared, records), records)
         all_parameters = override_parameters(bounded, settings.parameters)
@@ -173,7 +176,7 @@ class Problem:
         )
         return cls(
             model=tied,
-            untied_model=model,
+            given_model=given,
             records=records,
             settings=settings,
             all_parameters=all_parameters,
@@ -192,10 +195,15 @@ class Problem:
         Raises as `from_settings` does.
         """
         return self.from_settings(
-            self.untied_model if model is None else model,
+            self.given_model if model is None else model,
             self.records if records is None else records,
             replace(self.settings, **changes),
         )
+
+    @property
+    def untied_model(self) -> Model:
+        """The model with the starts of these settings, before its ties were replaced."""
+        return replace_starts(self.given_model, self.settings.initial)
 
     @property
     def prediction(self) -> PredictionKind:
@@ -219,8 +227,8 @@ class Problem:
 
     def __reduce__(self) -> _ReduceResult:
         if self.simulates_only:
-            return build_simulation_problem, (self.untied_model, self.records[0])
-        return Problem.from_settings, (self.untied_model, self.records, self.settings)
+            return build_simulation_problem, (self.given_model, self.records[0])
+        return Problem.from_settings, (self.given_model, self.records, self.settings)
 
     def share(self, key: str, compute: Callable[[], _Value]) -> _Value:
         """Return what does not depend on the values of the outputs, computed once for a sweep.
@@ -460,7 +468,7 @@ def build_simulation_problem(model: Model, record: Record) -> Problem:
     settings = FitSettings(weights=weights)
     return Problem(
         model=model,
-        untied_model=model,
+        given_model=model,
         records=(record,),
         settings=settings,
         all_parameters=model.parameters,

@@ -31,6 +31,7 @@ from sysid.models.model import (
 )
 from sysid.models.parameters import Parameter
 from sysid.models.parse import keep_terms
+from sysid.models.starts import replace_starts
 from sysid.models.ties import resolve_ties
 from sysid.simulation.problem import build_simulation_problem
 
@@ -213,6 +214,7 @@ def _restore(
     substeps = getattr(found, "substeps", None)
     if substeps is not None and substeps != model.solver.substeps:
         model = replace_substeps(model, substeps)
+    model = replace_starts(model, getattr(found, "initial", None))
     held = tuple(
         replace(channel, hold=found.holds.get(channel.name, "auto"))
         if channel.hold == "auto"

@@ -124,7 +124,7 @@ def test_a_history_function_equals_its_twin(method: str, interpolation: str, ste
 
 SWITCHING = {
     "x": "where(t > c and t < c + L, sqrt(t - c), where(mod(t - L, 0.2*c + 0.11) <= 0.1, v, 0)) + u"
-    " - b*x(t - 0.5*L)",
+    " - b*x(t - 0.5*L) + 0.1*u(t - L*(1 + 0.5*tanh(u)))",
     "v": "max(t - c, 0, x)*sign(c - t) + abs(t - 2*L) + floor(3*t) + clip(t, L, c) - v(t - L)"
     " + u(t - L) + table(t - L, [0, 0.2, 0.5], [0, b, 1]) + pchip(t, [0.33, 0.77], [c, 0]) - x",
 }

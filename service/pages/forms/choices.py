@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from sysid.core.settings import (
+    INITIAL_SETTINGS,
     LOSS_KINDS,
     NOISE_MODELS,
     PREDICTION_KINDS,
@@ -19,6 +20,7 @@ NAMES: Mapping[str, Sequence[str]] = {
     "noise_model": NOISE_MODELS,
     "prediction": PREDICTION_KINDS,
     "hold": HOLDS,
+    "initial": INITIAL_SETTINGS,
 }
 """Names to choose from, by the field of the form."""
 
@@ -28,25 +30,29 @@ DEFAULTS: Mapping[str, str] = {
     "noise_model": Loss().noise_model,
     "prediction": FitSettings().prediction,
     "hold": "",
+    "initial": "",
 }
-"""Preselected names; no hold, since the recording has one."""
+"""Preselected names; no hold and no start, since the recording and the model have one."""
 
 TEXTS: Mapping[str, str] = {
     "improved": "improved (islands, sequence search)",
     "improved-paper": "improved, as in the paper",
     "simple": "simple genetic algorithm",
     "soft-l1": "soft-l1 (outliers)",
-    "auto": "selected by the residuals (auto)",
+    "auto": "selected by the data (auto)",
     "ar1": "first-order coloured (ar1)",
     "simulation": "simulation (free run)",
     "one-step": "one step ahead",
+    "rest": "at rest (rest)",
+    "free": "estimated (free)",
+    "measured": "first measured values (measured)",
     "zero": "held (zero)",
     "first": "straight line (first)",
 }
 """Texts of names; a name without a text is shown itself."""
 
 
-_LABELS: Mapping[str, str] = {"noise_model": "noise", "kind": "loss"}
+_LABELS: Mapping[str, str] = {"noise_model": "noise", "kind": "loss", "initial": "start"}
 """Labels of fields that are not called like the setting."""
 
 

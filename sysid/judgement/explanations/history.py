@@ -2,7 +2,8 @@
 
 Before its first sample an input is assumed to be at its first value. What it was instead acts on
 the samples that read it: a column for each of some spans before the record, of one simulation each.
-States that start at a number or at a measured value have the slopes of the outputs as columns.
+States whose start is assumed, at a number, a measured value or a rest, have the slopes of the
+outputs as columns.
 """
 
 from collections.abc import Iterator
@@ -13,8 +14,8 @@ import numpy as np
 
 from sysid.core.errors import SysidError
 from sysid.data.records import Channel, History, Record
-from sysid.judgement.fixed_start import list_fixed_starts
 from sysid.judgement.residual_context import Candidate, ResidualContext
+from sysid.judgement.start_slopes import list_assumed_starts
 from sysid.judgement.unrecorded_input import compute_reach
 
 _SPANS = 4  # of the time that lags reach back before the record
@@ -27,7 +28,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
         return
     yield from _propose_inputs(context)
     yield from _propose_restarts(context)
-    states, slopes = list_fixed_starts(problem), context.fixed_start_slopes
+    states, slopes = list_assumed_starts(problem), context.fixed_start_slopes
     if slopes:
         yield Candidate(
             "start",
@@ -36,6 +37,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             "the record does not start as the model says",
             f"the record does not start where the model says that {', '.join(states)} does",
             "Use initial: free.",
+            is_added=True,
         )
 
 
@@ -63,6 +65,7 @@ def _propose_restarts(context: ResidualContext) -> Iterator[Candidate]:
                 "Identify both parts by themselves: give each a label in a column for --segments.",
                 counted=1,
                 moment=moment,
+                is_added=True,
             )
 
 
@@ -84,6 +87,7 @@ def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:
                 f"{name} moved before the record",
                 f"{name} was not at its first value before the record, as is assumed",
                 "Begin the record earlier, or leave its first samples out with skip.",
+                is_added=True,
             )
 
 

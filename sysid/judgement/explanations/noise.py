@@ -40,8 +40,7 @@ def find_disagreement_of_frequencies(context: ResidualContext) -> Iterator[Findi
     base = model.without
     if not base.is_coloured:
         return
-    still = base._replace(coefficients=np.zeros(base.coefficients.size))
-    moves = context.compute_moves(base, still)
+    moves = context.compute_moves(base)
     moved = [move.parameter for move in moves if abs(move.stderrs) > UNLIKELY_MOVE]
     if moved:
         size = max(abs(move.stderrs) for move in moves)

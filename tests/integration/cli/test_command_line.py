@@ -264,6 +264,17 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
     assert f"residuals on validation data: {verdict}" in done.stdout
 
 
+def test_identify_starts_at_rest_if_it_is_told_to(data: Path, tmp_path: Path) -> None:
+    result = tmp_path / "out.json"
+    settings = ("initial=rest", "algorithm.generations=20")
+    options = [word for setting in settings for word in ("--set", setting)]
+    done = run_lagid("identify", data, "--model", "fopdt", *options, "--output", result)
+    assert done.code == 0, done.stderr
+    document = json.loads(result.read_text())
+    assert document["initial"] == "rest"
+    assert [one["name"] for one in document["parameters"]] == ["K", "T", "L", "y0"]
+
+
 @pytest.mark.slow
 def test_identify_samples_the_posterior_as_far_as_the_budget_goes(
     data: Path, tmp_path: Path
@@ -307,6 +318,14 @@ def test_identify_samples_the_posterior_as_far_as_the_budget_goes(
         (
             ["--model", "fopdt", "--noise-model", "ar1", "--set", "prediction=one-step"],
             "--noise-model: ar1 needs the prediction 'simulation'",
+        ),
+        (
+            ["--model", "fopdt", "--set", "initial=resting"],
+            "--set initial: found 'resting'; need 'rest', 'free', 'measured' or 'auto'",
+        ),
+        (
+            ["--model", "fopdt", "--set", "initial=measured"],
+            "--set initial: 'measured' has no meaning for model 'fopdt'",
         ),
     ],
 )

@@ -290,7 +290,7 @@ parameters: {K: {lower: 0, upper: 5}, T: {lower: 0.1, upper: 5}, L: {lower: 0, u
 equations:
   x: >-
     where(t > T and not t >= T + L, K*sqrt(t - T), 0) + u + u(t - L) - x - 0.5*begin(t - 2*L)
-    + max(t - 3*T, 0, x)*sign(2.113 - t)
+    + max(t - 3*T, 0, x)*sign(2.113 - t) + 0.1*u(t - 0.4*L/(1.2 + tanh(u)))
   begin: x(t - L) - begin + where(mod(t - L, K) < T, 2, floor(t/T)) + clip(t, T, K)
 outputs: {x: x, y: begin + x(t - L)}
 history: {x: "where(t < -L, T, 3*sin(9*t)) + 0.3"}

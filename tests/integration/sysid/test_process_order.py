@@ -212,7 +212,7 @@ def write_fits(*bics: float) -> OrderComparison:
             [("fopdt", 1, 1.57), ("sopdt", 2, 1.4), ("topdt", 3, 1.3)], bics, strict=True
         )
     )
-    return compare_fits("sopdt", "L", "s", "white", fits)
+    return compare_fits("sopdt", "L", "s", "white", fits, 300)
 
 
 LAG = Estimate("L", "s", 1.4, 0.0, 5.0, 0.01, (1.38, 1.42), "identified")

@@ -13,6 +13,7 @@ import numpy as np
 
 from sysid.core.types import FloatArray
 from sysid.data.interpolation import FineInput
+from sysid.language.delays import mentions_time
 from sysid.language.tree import (
     Binary,
     Expression,
@@ -131,6 +132,8 @@ class ModelTwin:
         self.step = experiment.grid.integration_step
         self.names = [state.name for state in model.states]
         self.started = False
+        nodes = dict.fromkeys(node for equation in model.equations for node in walk(equation))
+        self.timely = [node for node in nodes if mentions_time(node)]
         self.past: dict[str, list[float]] = {}
         self.slopes: list[tuple[dict[str, float], dict[str, float]]] = []
         self.given: dict[str, list[float]] = {}
@@ -244,7 +247,7 @@ class ModelTwin:
     def _tell_sides(self, m: int, c: float) -> list[float]:
         """On which side of each of its switches in time the equations are."""
         told: list[float] = []
-        for node in dict.fromkeys(n for e in self.model.equations for n in walk(e)):
+        for node in self.timely:
             arguments = node.arguments if isinstance(node, FunctionCall) else ()
             ends = [self._value_in_time(argument, m, c) for argument in arguments]
             match node:

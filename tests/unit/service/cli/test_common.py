@@ -74,6 +74,7 @@ def test_every_field_that_an_option_gives_is_told_at_that_option() -> None:
         "loss",
         "weights",
         "skip",
+        "initial",
         "algorithm",
         "priority",
         "reuse",

@@ -48,6 +48,6 @@ def test_an_estimate_at_its_bound_or_of_a_search_that_did_not_settle_has_no_erro
     for status in ("at bound", "not settled"):
         assert find_shown_error(0.1, status) is None
         assert format_interval((0.1, 0.2), 0.05, status=status) == ""
-    assert find_shown_error(0.1, "order-dependent") == 0.1
+    assert find_shown_error(0.1, "dependent") == 0.1
     assert plain_estimate(0.0937, 0.0072, status="not settled") == "0.0937"
     assert join_estimate(-0.0937, 0.0072, status="not settled") == "−0.0937000"

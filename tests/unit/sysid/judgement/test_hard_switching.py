@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sysid.data.records import Channel, Record
-from sysid.judgement.hard_switching import warn_hard_switching
+from sysid.judgement.hard_switching import find_hard_switches
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
 
@@ -43,17 +43,18 @@ def build_problem(friction: str) -> Problem:
     ],
 )
 def test_a_switch_is_named_with_its_smooth_form(friction: str, smooth: str) -> None:
-    [note] = warn_hard_switching(build_problem(friction), THETA, APART)
-    assert "RMS 0.02 to 0.3 m" in note
-    assert smooth in note
+    [note] = find_hard_switches(build_problem(friction), THETA, APART)
+    assert note.severity == "note"
+    assert "RMS 0.02 to 0.3 m" in note.text
+    assert smooth in note.text
     replaced = smooth.replace("/e", "/0.01")
     rough, even = (build_problem(one).predict(THETA[None])[0] for one in (friction, replaced))
     np.testing.assert_allclose(rough, even, atol=0.02)
-    assert warn_hard_switching(build_problem(replaced), THETA, APART) == []
+    assert not list(find_hard_switches(build_problem(replaced), THETA, APART))
 
 
 def test_islands_that_agree_and_losses_without_jumps_are_not_reported() -> None:
-    assert warn_hard_switching(build_problem("sign(v)"), THETA, [0.02, 0.0201, np.inf]) == []
-    assert warn_hard_switching(build_problem("where(v > 0, v, v)"), THETA, APART) == []
-    assert warn_hard_switching(build_problem("sign(q)*v"), THETA, APART) == []
-    assert warn_hard_switching(build_problem("abs(v)*v"), THETA, APART) == []
+    assert not list(find_hard_switches(build_problem("sign(v)"), THETA, [0.02, 0.0201, np.inf]))
+    assert not list(find_hard_switches(build_problem("where(v > 0, v, v)"), THETA, APART))
+    assert not list(find_hard_switches(build_problem("sign(q)*v"), THETA, APART))
+    assert not list(find_hard_switches(build_problem("abs(v)*v"), THETA, APART))

@@ -10,9 +10,12 @@ from sysid.core.settings import GeneticAlgorithm
 from sysid.data.derivations import derive_recording
 from sysid.data.records import Channel, Recording
 from sysid.identification.identify import identify
-from sysid.judgement.unrecorded_input import find_assumed_samples, warn_unrecorded_input
+from sysid.judgement.judge import explain_residuals
+from sysid.judgement.residual_context import ResidualContext
+from sysid.judgement.unrecorded_input import find_assumed_samples, find_unrecorded_input
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import FixedInitial, Model
+from sysid.results.findings import Finding
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
@@ -56,45 +59,51 @@ def analyse_problem(problem: Problem) -> Analysis:
     return analyse_estimate(problem, found.theta)
 
 
-def list_notes(problem: Problem) -> list[str]:
-    return warn_unrecorded_input(problem, analyse_problem(problem), is_contradicted=False)
+def explain(problem: Problem) -> list[Finding]:
+    analysis = analyse_problem(problem)
+    theta = np.array([one.value for one in analysis.estimates if one.is_free])
+    found = explain_residuals(ResidualContext(problem, theta, analysis)).findings
+    return [one for one in found if one.explanation == "input before the record"]
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_record_that_begins_in_the_middle_of_a_test_is_told_of(seed: int) -> None:
     recording = make_recording(seed, was_at_rest=False)
-    problem = build_problem(recording, history=False)
-    [note] = list_notes(problem)
-    assert note.startswith("8 samples read an input from before the record")
-    assert "of its standard errors away" in note
-    assert note.endswith("or skip: 8")
-    assert list_notes(build_problem(recording, history=True)) == []
-    assert list_notes(build_problem(recording, history=False, skip=8)) == []
+    [found] = explain(build_problem(recording, history=False))
+    assert found.brief == "u moved before the record"
+    assert found.family == "history"
+    assert found.severity == "caution"
+    assert "skip" in found.advice
+    assert explain(build_problem(recording, history=True)) == []
+    assert explain(build_problem(recording, history=False, skip=8)) == []
 
 
-def test_what_is_told_is_what_estimation_without_these_samples_gives() -> None:
+def test_its_moves_are_those_of_estimation_without_these_samples() -> None:
     recording = make_recording(1, was_at_rest=False)
-    [note] = list_notes(build_problem(recording, history=False))
+    [found] = explain(build_problem(recording, history=False))
     without = {
-        e.name: e.value
-        for e in analyse_problem(build_problem(recording, history=False, skip=8)).estimates
+        one.name: one
+        for one in analyse_problem(build_problem(recording, history=False, skip=8)).estimates
     }
-    whole = {
-        e.name: e.value for e in analyse_problem(build_problem(recording, history=False)).estimates
-    }
-    told = [name for name in ("K", "T", "L") if f"{name} is " in note]
-    assert told
-    for name in told:
-        assert f"{name} is {without[name]:.4g} instead of {whole[name]:.4g}, " in note
-    assert abs(without["T"] - TRUE["T"]) < abs(whole["T"] - TRUE["T"])
+    for move in found.moves:
+        if move.parameter in found.parameters:
+            other = without[move.parameter]
+            assert abs(move.value - other.value) < 2 * (other.stderr or 0.0)
 
 
 def test_of_a_record_that_begins_at_rest_nothing_is_told() -> None:
-    """The guess is right, so the first samples fit the others: 20 draws, none warned of."""
+    """The guess is right, so the first samples fit the others: 20 draws, none told of."""
     for seed in range(20):
-        assert (
-            list_notes(build_problem(make_recording(seed, was_at_rest=True), history=False)) == []
-        )
+        assert explain(build_problem(make_recording(seed, was_at_rest=True), history=False)) == []
+
+
+def test_a_contradiction_is_a_note_that_says_what_to_skip() -> None:
+    problem = build_problem(make_recording(0, was_at_rest=False), history=False)
+    analysis = analyse_problem(problem)
+    assert list(find_unrecorded_input(problem, analysis, is_contradicted=False)) == []
+    [found] = find_unrecorded_input(problem, analysis, is_contradicted=True)
+    assert (found.severity, found.parameters) == ("note", ())
+    assert found.advice.endswith("skip: 8.")
 
 
 def test_samples_that_read_an_assumed_input_end_with_the_estimated_lag() -> None:
@@ -113,12 +122,11 @@ def test_samples_that_read_an_assumed_input_end_with_the_estimated_lag() -> None
     assert np.count_nonzero(part) == 4
 
 
-def test_of_a_model_with_given_starts_nothing_is_told() -> None:
-    """Left out or not, the samples that follow start where the guess has led to."""
+def test_a_given_start_does_not_hide_an_input_that_was_assumed_wrongly() -> None:
     recording = make_recording(2, was_at_rest=False)
     start = float(recording.channel("y").values[CUT]) - TRUE["y0"]
     model = replace(FOPDT, initial=(FixedInitial(start),))
-    assert list_notes(build_problem(recording, history=False, model=model)) == []
+    assert len(explain(build_problem(recording, history=False, model=model))) == 1
 
 
 def test_a_result_warns() -> None:
@@ -127,4 +135,5 @@ def test_a_result_warns() -> None:
     )
     record = part.to_record({"u": "u"}, {"y": "y"})
     found = identify(FOPDT, record, GeneticAlgorithm(generations=80), parameters=BOUNDS)
-    assert any("Its first value is assumed there" in one for one in found.warnings)
+    assert any("not at its first value before the record" in one for one in found.warnings)
+    assert "u moved before the record" in found.verdict.text

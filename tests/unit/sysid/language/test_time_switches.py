@@ -1,8 +1,10 @@
 """Sides of switches in time: what jumps or bends with t and parameters alone."""
 
+import numpy as np
 import pytest
 
 from sysid.language.checker import check_expression
+from sysid.language.evaluation import evaluate_signal
 from sysid.language.printer import format_expression
 from sysid.language.scope import Scope
 from sysid.language.time_switches import list_sides
@@ -42,6 +44,14 @@ def test_each_jump_and_bend_has_its_sides(written: str, sides: list[str]) -> Non
 def test_whole_numbers_and_remainders_are_sides_themselves() -> None:
     found = [format_expression(one) for one in list_sides([tree("floor(t/a)"), tree("mod(t, a)")])]
     assert found == ["floor(t/a)", "floor((t - mod(t, a))/a + 0.5)"]
+
+
+def test_the_side_of_a_remainder_changes_exactly_where_it_begins_anew() -> None:
+    remainder = tree("mod(t, 0.1)")
+    times = np.linspace(0.0, 10.0, 100_001)
+    (side,) = (evaluate_signal(one, times) for one in list_sides([remainder]))
+    rest = evaluate_signal(remainder, times)
+    np.testing.assert_array_equal(np.diff(side), np.diff(rest) < 0)
 
 
 @pytest.mark.parametrize(

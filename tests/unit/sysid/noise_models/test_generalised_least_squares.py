@@ -17,6 +17,7 @@ from sysid.models.catalogue.load import load_model
 from sysid.noise_models.generalised_least_squares import fit_generalised_least_squares
 from sysid.residuals.series import make_whitening
 from sysid.residuals.whitening import Whitening, compute_ar1_coefficient
+from sysid.results.identification import Identification
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
@@ -173,7 +174,7 @@ def test_intervals_under_first_order_noise_hold_the_truth() -> None:
 def test_the_likelihood_tells_that_the_noise_model_is_the_better_one() -> None:
     plain, found = (
         identify(load_model(GAIN), make_record(3), SMALL, loss=loss, skip=1)
-        for loss in (Loss(), AR1)
+        for loss in (Loss(noise_model="white"), AR1)
     )
     assert plain.criteria is not None
     assert found.criteria is not None
@@ -185,7 +186,7 @@ def test_the_likelihood_tells_that_the_noise_model_is_the_better_one() -> None:
 def test_residuals_are_tested_without_what_the_noise_model_explains() -> None:
     plain, found = (
         identify(load_model(GAIN), make_record(3), SMALL, loss=loss, skip=1)
-        for loss in (Loss(), AR1)
+        for loss in (Loss(noise_model="white"), AR1)
     )
     assert plain.residual_tests is not None
     assert found.residual_tests is not None
@@ -283,23 +284,27 @@ def test_every_output_has_a_noise_of_its_own_and_a_kept_part_is_judged() -> None
     assert {one.output for one in found.residual_tests.tests} == {"y", "z"}
 
 
-def list_advice(u: FloatArray, y: FloatArray) -> list[str]:
+def identify_line(u: FloatArray, y: FloatArray) -> Identification:
     times = STEP * np.arange(u.size)
     one = Record((Channel("u", times, u, hold="first"),), (Channel("y", times, y),))
-    told = identify(load_model(GAIN), one, SMALL, skip=1).warnings
-    return [text for text in told if "noise_model='ar1'" in text]
+    return identify(load_model(GAIN), one, SMALL, skip=1)
 
 
-def test_slow_noise_is_told_with_its_remedy_also_without_a_lag() -> None:
+def test_slow_noise_is_taken_into_account_without_a_hedge() -> None:
     u = np.random.default_rng([3, 1]).choice([-1.0, 1.0], N)
-    (text,) = list_advice(u, 2.0 * u + 1.0 + 0.2 * colour_noise(N, POLE, 3))
-    assert "slow noise of y" in text
-    assert not list_advice(u, 2.0 * u + 1.0 + 0.2 * colour_noise(N, 0.0, 3))
+    slow = identify_line(u, 2.0 * u + 1.0 + 0.2 * colour_noise(N, POLE, 3))
+    assert (slow.noise_model, slow.verdict.text) == ("ar1", "trustworthy")
+    assert any("assume first-order noise" in text for text in slow.warnings)
+    white = identify_line(u, 2.0 * u + 1.0 + 0.2 * colour_noise(N, 0.0, 3))
+    assert (white.noise_model, white.verdict.text) == ("white", "trustworthy")
+    assert white.warnings == ()
 
 
-def test_no_noise_model_is_advised_where_the_residuals_are_dynamics() -> None:
+def test_dynamics_are_no_noise() -> None:
     u = np.repeat(np.random.default_rng([3, 2]).choice([-1.0, 1.0], N // 4), 4)
     y, pole = np.zeros(N), 0.8
     for k in range(1, N):
         y[k] = pole * y[k - 1] + (1.0 - pole) * 2.0 * u[k - 1]
-    assert not list_advice(u, y + 0.01 * colour_noise(N, 0.0, 3))
+    found = identify_line(u, y + 0.01 * colour_noise(N, 0.0, 3))
+    assert found.noise_model == "white"
+    assert found.verdict.trust == "not trustworthy"

@@ -1,7 +1,7 @@
 """An input that a controller makes from the output is recognised; one of an open loop is not."""
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -136,15 +136,14 @@ def test_a_regulated_record_without_reference_is_warned_of() -> None:
     u, y = simulate_loop(1, np.zeros(N))
     record = Record((make_held_input(u),), (Channel("y", TIMES, y),))
 
-    def read_note(**options: Any) -> str:
+    for options in ({}, {"loss": Loss(noise_model="ar1")}):
         found = identify(load_model("fopdt"), [record], seed=1, **options)
-        [note] = [one for one in found.warnings if "closed loop" in one]
-        return note
-
-    note = read_note()
-    assert note.startswith("input 'u' follows the residuals of y: they explain")
-    assert "use loss=Loss(noise_model='ar1')" in note
-    assert "noise_model" not in read_note(loss=Loss(noise_model="ar1"))
+        [loop] = [one for one in found.findings if one.explanation == "feedback"]
+        assert loop.text.startswith("input 'u' follows the residuals of y: they explain")
+        assert loop.severity == "caution"
+        assert loop.parameters == tuple(one.name for one in found.parameters)
+        assert found.verdict.trust == "not trustworthy"
+        assert not any(one.status == "identified" for one in found.parameters)
     assert describe_feedback([]) == []
 
 

@@ -189,7 +189,7 @@ def test_only_generic_models_of_the_catalogue_follow_the_data() -> None:
     following = {
         name
         for name in catalogue()
-        if any(parameter.bounds for parameter in list_parameters(load_model(name)))
+        if any(parameter.bounds for parameter in load_model(name).parameters)
     }
     assert following == set(GENERIC)
 
@@ -225,7 +225,7 @@ def test_a_recursion_has_no_bounds_of_a_plant() -> None:
         "parameters": {"a": {"lower": 0, "upper": 1, "bounds": "gain"}},
         "equations": {"y": "a*y(k-1)"},
         "outputs": {"y": "y"},
-        "initial": {"y": {"lower": 0, "upper": 1, "bounds": "state"}},
+        "initial": {"y": {"lower": 0, "upper": 1, "bounds": "offset"}},
     }
     with pytest.raises(InvalidModel) as refusal:
         parse_model(document)

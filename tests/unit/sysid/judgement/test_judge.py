@@ -1,0 +1,202 @@
+"""The judge: the likeliest explanations, one beside the other, on one scale."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sysid.core.settings import Loss
+from sysid.judgement.conclusions import order_findings
+from sysid.judgement.judge import Explained, explain_residuals, select_explanations
+from sysid.judgement.levels import DEFECT_GAIN, STRONG_ODDS
+from sysid.judgement.residual_context import ResidualContext
+from sysid.models.parse import parse_model
+from sysid.results.findings import Finding, note
+from sysid.uncertainty.analysis import analyse_estimate
+from tests.support.library.defects import CONSTANCY, LATE, SENSOR, TIMES
+from tests.support.library.judged_records import (
+    FAST,
+    FINE,
+    NOISE,
+    N,
+    build_context,
+    draw_levels,
+    draw_noise,
+    draw_record,
+    explain,
+    hold,
+    list_names,
+    make_record,
+)
+from tests.support.library.small_models import LINE
+
+
+def make_finding(explanation: str, gain: float | None, *names: str) -> Finding:
+    severity = "caution" if names else "note"
+    return Finding(
+        explanation,
+        "structure",
+        severity,
+        explanation,
+        f"{explanation}.",
+        gain=gain,
+        parameters=names,
+    )
+
+
+def explain_line(*parts: np.ndarray) -> Explained:
+    """Explain what a line leaves of a record with defects (n,)."""
+    u = draw_levels(1)
+    y = 2.0 * u + 1.0 + NOISE * draw_noise(1) + np.sum(parts, axis=0)
+    return explain_residuals(
+        build_context([make_record(u, y)], parse_model(LINE), {"a": 2.0, "b": 1.0})
+    )
+
+
+@pytest.mark.parametrize(
+    ("bend", "jump"),
+    [
+        (0.2, 0.1),
+        (0.2, 0.4),
+        (0.5, 0.4),
+        pytest.param(
+            0.5,
+            0.1,
+            marks=pytest.mark.xfail(
+                strict=True, reason="what gains little alone is not tried beside the first"
+            ),
+        ),
+    ],
+)
+def test_two_defects_are_both_found(bend: float, jump: float) -> None:
+    curve, late = bend * (draw_levels(1) - 1.0) ** 2, jump * LATE
+    found = explain_line(curve, late)
+    briefs = " ".join(one.brief for one in found.findings)
+    assert "y is curved" in briefs
+    assert "at about 11" in briefs or "from about 11" in briefs
+    alone = explain_line(curve).findings
+    assert "about" not in " ".join(one.brief for one in alone)
+
+
+def test_one_defect_is_one_finding_and_its_rivals_are_in_its_text() -> None:
+    """An offset of the line, of the sensor, and a load are the same to a line."""
+    (found,) = explain_line(0.3 * LATE).findings
+    assert found.explanation in ("change of a parameter", "step of a sensor", "load")
+    assert "As likely: " in found.text
+    assert found.text.count("about 115 s") >= 3
+
+
+def test_what_explains_is_worth_a_defect_and_no_sound_record_has_it() -> None:
+    for seed in range(5):
+        u = draw_levels(seed)
+        y = 2.0 * u + 1.0 + NOISE * draw_noise(seed, 0.8)
+        context = build_context([make_record(u, y)], parse_model(LINE), {"a": 2.0, "b": 1.0})
+        assert explain_residuals(context).findings == ()
+    for one in explain_line(0.3 * LATE).findings:
+        assert one.gain is not None
+        assert one.gain > DEFECT_GAIN
+
+
+def test_more_of_a_defect_gains_more() -> None:
+    gains = [explain_line(size * LATE).findings[0].gain or 0.0 for size in (0.05, 0.1, 0.3)]
+    assert gains == sorted(gains)
+
+
+def test_simulations_are_counted_and_few() -> None:
+    context = build_context([draw_record(FAST, 1)], "fopdt", FAST.values)
+    explain_residuals(context)
+    assert 10 < len(context.spent) < 200
+
+
+def test_a_repeated_judgement_is_the_same() -> None:
+    record = CONSTANCY[1].draw(FAST, 1)
+    assert explain(FAST, record) == explain(FAST, record)
+
+
+@pytest.mark.parametrize("gain", [1e-3, 1e6])
+def test_units_do_not_matter(gain: float) -> None:
+    """The same record in another unit of its output has the same explanations."""
+    record = SENSOR[1].draw(FAST, 1)
+    (y,) = record.outputs
+    scaled = replace(record, outputs=(replace(y, values=gain * y.values),))
+    values = FAST.values
+    other = {**values, "K": gain * values["K"], "y0": gain * values["y0"]}
+    first = explain_residuals(build_context([record], "fopdt", values)).findings
+    second = explain_residuals(build_context([scaled], "fopdt", other)).findings
+    assert [one.explanation for one in first] == [one.explanation for one in second]
+    assert [one.parameters for one in first] == [one.parameters for one in second]
+    gains = [one.gain or 0.0 for one in first]
+    assert [one.gain for one in second] == pytest.approx(gains, rel=0.02, abs=1.0)
+
+
+@pytest.mark.parametrize("samples", [12, 25, 60])
+def test_short_records_are_judged_or_left_alone(samples: int) -> None:
+    u = draw_levels(1, samples)
+    y = 2.0 * u + NOISE * draw_noise(1, n=samples)
+    context = build_context([make_record(u, y)], parse_model(LINE), {"a": 2.0})
+    assert explain_residuals(context) == Explained((), is_done=samples > 14)
+
+
+def test_residuals_of_nothing_are_not_judged() -> None:
+    u = draw_levels(1)
+    exact = build_context([make_record(u, 2.0 * u + 1.0)], parse_model(LINE), {"a": 2.0, "b": 1.0})
+    found = explain_residuals(exact)
+    assert all(one.severity == "note" for one in found.findings)
+
+
+def test_only_squares_are_judged() -> None:
+    record = CONSTANCY[1].draw(FAST, 1)
+    robust = build_context([record], "fopdt", FAST.values, loss=Loss("soft-l1", 0.1))
+    assert explain_residuals(robust) == Explained()
+    context = build_context([record], "fopdt", FAST.values)
+    bare = analyse_estimate(context.problem, context.theta, 0)
+    assert bare.residuals_and_sensitivities is None
+    assert explain_residuals(ResidualContext(context.problem, context.theta, bare)) == Explained()
+
+
+def test_noise_is_what_moves_no_estimate() -> None:
+    moved, still = make_finding("order", 30.0, "L"), make_finding("outliers", 90.0)
+    assert Explained((), True).is_noise
+    assert Explained((still,), True).is_noise
+    assert not Explained((still, moved), True).is_noise
+
+
+def test_of_two_scales_the_likelier_explanations_are_kept() -> None:
+    curve, second = make_finding("curve", 40.0, "K"), make_finding("drift", 20.0, "T")
+    order = make_finding("order", 41.0, "L")
+    assert select_explanations((curve, second), (order,)) == (curve, second, order)
+    likelier = replace(order, gain=40.0 + STRONG_ODDS + 1.0)
+    assert select_explanations((curve, second), (likelier,)) == (likelier,)
+    less = replace(order, gain=40.0 - STRONG_ODDS - 1.0)
+    assert select_explanations((curve, second), (less,)) == (curve, second)
+
+
+def test_what_is_compared_with_nothing_is_kept_always() -> None:
+    remark = note("irregular sampling", "reading", "u is sampled irregularly")
+    curve = make_finding("curve", 40.0, "K")
+    assert select_explanations((curve,), (remark,)) == (curve, remark)
+    assert select_explanations((), ()) == ()
+    assert select_explanations((), (remark,)) == (remark,)
+    order = make_finding("order", 8.0, "L")
+    assert select_explanations((), (order,)) == (order,)
+
+
+def test_outliers_hide_no_change_and_no_change_hides_them() -> None:
+    u = draw_levels(1)
+    y = FAST.respond(hold(u))[::FINE] + 0.3 * LATE + NOISE * draw_noise(1)
+    y[np.random.default_rng(5).choice(N, 8, replace=False)] += 2.0
+    names = list_names(explain(FAST, make_record(u, y)))
+    assert names[0] in ("change of a parameter", "step of a sensor")
+    assert "outliers" in names
+
+
+@pytest.mark.xfail(strict=True, reason="the gain of a second finding is beside that of the first")
+def test_what_was_found_first_is_the_reason() -> None:
+    u = draw_levels(1)
+    share = TIMES / TIMES[-1]
+    late = replace(FAST, delay=FAST.delay + 0.8)
+    first, second = (one.respond(hold(u))[::FINE] for one in (FAST, late))
+    y = (1.0 - share) * first + share * second + NOISE * draw_noise(1)
+    found = explain(FAST, make_record(u, y)).findings
+    assert found[0].explanation in ("drift of a clock", "drift of a time lag")
+    assert order_findings(found)[0] == found[0]

@@ -1,0 +1,230 @@
+"""What explanations start from: where something begins, moves, other inputs, names of samples."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
+from sysid.models.catalogue.load import load_model
+from sysid.models.parse import parse_model
+from tests.support.library.judged_records import (
+    FAST,
+    FINE,
+    NOISE,
+    STEP,
+    N,
+    build_context,
+    draw_levels,
+    draw_noise,
+    draw_record,
+    hold,
+    make_record,
+)
+from tests.support.library.small_models import LINE
+
+TWO_OUTPUTS = parse_model(
+    LINE | {"name": "two", "outputs": {"y": "a*u(t) + b + x", "z": "a*u(t) - b + x"}}
+)
+
+
+def build_line(*shifts: FloatArray, times: FloatArray | None = None) -> ResidualContext:
+    """A line through a noisy record for each shift (n,) of its output."""
+    records = []
+    for number, shift in enumerate(shifts):
+        u = draw_levels(number, shift.size)
+        y = 2.0 * u + 1.0 + NOISE * draw_noise(number, n=shift.size) + shift
+        records.append(make_record(u, y, times=times))
+    return build_context(records, parse_model(LINE), {"a": 2.0, "b": 1.0})
+
+
+def step_at(position: int, n: int = N, size: float = 0.2) -> FloatArray:
+    return np.where(np.arange(n) >= position, size, 0.0)
+
+
+def find_moments(context: ResidualContext) -> list[tuple[float, str]]:
+    column = context.weigh(np.ones(context.times.size))[:, 0]
+    return [(moment, where) for moment, _, where in context.find_breaks(column)]
+
+
+@pytest.mark.parametrize("position", [60, 200, 350])
+def test_a_break_is_found_at_its_sample(position: int) -> None:
+    moments = find_moments(build_line(step_at(position)))
+    assert moments
+    assert min(abs(moment - STEP * position) for moment, _ in moments) <= STEP
+    assert f"{moments[0][0]:.4g} s" == moments[0][1]
+
+
+def test_the_late_part_of_a_column_begins_at_the_break_and_ends_with_its_experiment() -> None:
+    context = build_line(np.zeros(N), step_at(150), np.zeros(N))
+    column = context.weigh(np.arange(3.0 * N) + 1.0)[:, 0]
+    for moment, late, where in context.find_breaks(column):
+        assert where.endswith(" of experiment 2")
+        (rows,) = np.nonzero(late)
+        np.testing.assert_array_equal(late[rows], column[rows])
+        assert rows[0] == N + round(moment / STEP)
+        assert rows[-1] == 2 * N - 1
+
+
+def test_an_experiment_that_differs_as_a_whole_breaks_at_its_first_sample() -> None:
+    moments = find_moments(build_line(np.zeros(N), step_at(0)))
+    assert "0 s of experiment 2" in [where for _, where in moments]
+
+
+def test_no_break_is_looked_for_at_the_edges() -> None:
+    for position in (3, N - 3):
+        for moment, _ in find_moments(build_line(step_at(position, size=5.0))):
+            assert 0.05 * N * STEP <= moment <= 0.95 * N * STEP
+
+
+def test_a_break_is_found_between_irregular_times() -> None:
+    times = np.cumsum(np.random.default_rng(1).uniform(0.1, 1.5, N))
+    moments = find_moments(build_line(step_at(170), times=times))
+    assert min(abs(moment - times[170]) for moment, _ in moments) <= 1.5
+
+
+def test_missing_samples_are_left_out() -> None:
+    shift = step_at(200)
+    shift[50:90] = np.nan
+    context = build_line(shift)
+    assert context.times.size == N - 40
+    assert not np.isin(STEP * np.arange(50, 90), context.times).any()
+    assert np.all(np.isfinite(context.measured))
+    (moment, _), *_ = find_moments(context)
+    assert moment == pytest.approx(200 * STEP, abs=STEP)
+
+
+def test_each_output_has_its_rows_and_its_name() -> None:
+    records = []
+    for seed in (1, 2):
+        u, times = draw_levels(seed), STEP * np.arange(N)
+        outputs = tuple(
+            Channel(name, times, 2.0 * u + sign + NOISE * draw_noise(seed + number))
+            for number, (name, sign) in enumerate((("y", 1.0), ("z", -1.0)))
+        )
+        records.append(Record((Channel("u", times, u, hold="zero"),), outputs))
+    context = build_context(records, TWO_OUTPUTS, {"a": 2.0, "b": 1.0})
+    rows = {name: mask for name, mask, _ in context.iterate_outputs()}
+    assert [*rows] == ["y", "z"]
+    np.testing.assert_array_equal(rows["y"], ~rows["z"])
+    assert rows["y"].sum() == 2 * N
+    assert context.measured[rows["y"]].mean() > context.measured[rows["z"]].mean()
+    names = [context.name_part(part) for part in context.parts]
+    assert names == [
+        "y of experiment 1",
+        "z of experiment 1",
+        "y of experiment 2",
+        "z of experiment 2",
+    ]
+
+
+def test_the_same_inputs_give_the_same_simulation_and_others_their_response() -> None:
+    context = build_line(np.zeros(N))
+    same = context.simulate(context.problem.records)
+    np.testing.assert_array_equal(same, context.simulated)
+    higher = context.simulate(context.replace_input("u", lambda values: values + 1.0))
+    a = context.theta[context.problem.free_names.index("a")]
+    np.testing.assert_allclose(higher - context.simulated, a, rtol=1e-9)
+    assert len(context.spent) >= 2
+    assert context.problem.records[0].inputs[0].values.max() <= 2.0  # the own record is as it was
+
+
+def compare_moves(shift: FloatArray, pattern: FloatArray) -> None:
+    """Compare moves and values with least squares of both columns: a line is linear."""
+    context = build_line(shift)
+    model = context.residual_model
+    moves = context.compute_moves(model.fit(context.weigh(pattern)))
+    u, y = draw_levels(0), context.measured
+    before = np.linalg.lstsq(np.column_stack([u, np.ones(N)]), y, rcond=None)[0]
+    after = np.linalg.lstsq(np.column_stack([u, np.ones(N), pattern]), y, rcond=None)[0]
+    known = {one.name: one for one in context.analysis.estimates}
+    assert {move.parameter for move in moves} == {"a", "b"}
+    assert abs(moves[0].stderrs) >= abs(moves[1].stderrs)
+    for name, old, new in zip("ab", before, after[:2], strict=True):
+        (move,) = (move for move in moves if move.parameter == name)
+        assert known[name].value == pytest.approx(old, rel=1e-6)
+        assert move.value == pytest.approx(new, abs=0.2 * (move.stderr or 0.0))
+        assert move.stderrs == pytest.approx((move.value - old) / (known[name].stderr or 0.0))
+
+
+def test_moves_are_what_least_squares_of_both_columns_changes() -> None:
+    pattern = np.random.default_rng(9).standard_normal(N) + 0.5 * draw_levels(0)
+    compare_moves(0.05 * pattern, pattern)
+
+
+def test_the_value_of_a_move_is_that_with_the_explanation_also_beside_coloured_residuals() -> None:
+    compare_moves(step_at(230), step_at(230, size=1.0))
+
+
+def test_a_parameter_that_varies_moves_to_its_furthest_value() -> None:
+    context = build_line(step_at(230))
+    model = context.residual_model
+    number = context.problem.free_names.index("b")
+    fit = model.fit(model.columns[:, [number]] * (step_at(230) > 0)[:, None], 1)
+    (own,) = (
+        move
+        for move in context.compute_moves(fit, None, (number, 0.0, 1.0))
+        if move.parameter == "b"
+    )
+    values = {1.0: abs(1.0 - context.theta[number]), 1.2: abs(1.2 - context.theta[number])}
+    assert own.value == pytest.approx(max(values, key=lambda one: values[one]), abs=0.02)
+
+
+def test_a_full_fit_to_the_true_input_finds_the_truth() -> None:
+    u = draw_levels(1)
+    y = FAST.respond(hold(np.minimum(u, 1.2)))[::FINE] + NOISE * draw_noise(1)
+    context = build_context([make_record(u, y)], "fopdt", FAST.values)
+    found = context.refit(context.replace_input("u", lambda values: np.minimum(values, 1.2)))
+    assert found is not None
+    assert found.criterion < context.residual_model.without.criterion
+    for move in found.moves:
+        assert move.stderr is not None
+        assert abs(move.value - FAST.values[move.parameter]) < 4 * move.stderr
+
+
+def test_an_input_is_read_some_periods_before_and_after_its_jump() -> None:
+    context = build_line(np.zeros(N))
+    u = draw_levels(0)
+    np.testing.assert_array_equal(context.read_input("u"), u)
+    np.testing.assert_array_equal(context.read_input("u", 3.0)[3:], u[:-3])
+    assert context.inputs == ["u"]
+    assert [channel.name for channel in context.moving_inputs] == ["u"]
+    still = [replace(context.problem.records[0], inputs=(Channel("u", [0.0, 1e3], [1.0, 1.0]),))]
+    rested = build_context(
+        still, parse_model(LINE), {"a": 2.0, "b": 1.0}, parameters={"b": {"fixed": 1.0}}
+    )
+    assert rested.moving_inputs == []
+
+
+def test_the_largest_innovations_are_the_shocks() -> None:
+    shift = np.zeros(N)
+    shift[[40, 250]] = 1.0, -2.0
+    assert build_line(shift).find_shocks()[:2] == [250, 40]
+
+
+def test_the_slope_is_that_of_the_simulated_output_within_an_experiment() -> None:
+    context = build_context([draw_record(FAST, 1), draw_record(FAST, 2)], "fopdt", FAST.values)
+    for part in context.parts:
+        values = context.simulated[part.rows]
+        expected = np.gradient(values, part.times)
+        np.testing.assert_allclose(context.slope[part.rows], expected)
+
+
+def test_parameters_that_lags_depend_on_are_delays_and_starts_are_not_declared() -> None:
+    context = build_context([draw_record(FAST, 1)], "fopdt", FAST.values)
+    assert context.delays == {"L"}
+    assert [name for _, name in context.declared] == ["K", "T", "L", "y0"]
+    tied = load_model(
+        {
+            **load_model("fopdt").document,
+            "parameters": {
+                **load_model("fopdt").document["parameters"],
+                "V": {"lower": 0.9, "upper": 5.0},
+            },
+            "equations": {"x": "(K*u(t - L/V) - x)/T"},
+        }
+    )
+    problem = build_context([draw_record(FAST, 1)], tied, {**FAST.values, "V": 1.0}).problem
+    assert find_delay_parameters(problem) == {"L", "V"}
