@@ -20,7 +20,7 @@ from tests.support.library.defects import (
     READING,
     SENSOR,
     STRUCTURE,
-    Case,
+    DefectCase,
 )
 from tests.support.library.judged_records import (
     FAST,
@@ -63,7 +63,7 @@ def test_nothing_is_found_in_a_sound_record_with_noise_of_any_colour(
         for number, plant in enumerate(case.plants)
     ],
 )
-def test_a_defect_is_found_by_its_name(case: Case, plant: Process) -> None:
+def test_a_defect_is_found_by_its_name(case: DefectCase, plant: Process) -> None:
     first = explain(plant, case.draw(plant, case.seed)).findings[0]
     assert first.explanation in case.explanations
     assert first.gain is not None
@@ -151,7 +151,9 @@ def test_a_text_has_one_value_before_a_change() -> None:
         for plant, name in zip(PLANTS, names, strict=True)
     ],
 )
-def test_a_parameter_that_changes_is_not_identified(case: Case, plant: Process, name: str) -> None:
+def test_a_parameter_that_changes_is_not_identified(
+    case: DefectCase, plant: Process, name: str
+) -> None:
     findings = explain(plant, case.draw(plant, 1)).findings
     assert name in {parameter for one in findings for parameter in one.parameters}
 
