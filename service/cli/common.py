@@ -27,7 +27,13 @@ from service.core.errors import FieldError, InvalidRequest
 from service.core.label_text import format_value
 from sysid.core.errors import join_pointer, split_pointer
 from sysid.core.files import open_replacement
-from sysid.core.text import DASH, plain_estimate, rewrite_settings
+from sysid.core.text import (
+    DASH,
+    plain_estimate,
+    plain_interval,
+    rewrite_settings,
+    split_estimate,
+)
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -246,13 +252,13 @@ def _advise_start(state: str, fields: Sequence[str], value: str) -> str:
     document = "write it into the model's document, which lagid models show prints"
     given = parse_yaml(value.encode())
     if not fields and not isinstance(given, int | float | Mapping):
-        return f"no option sets how a state starts; {document}"
+        return f"no option sets how one state starts; {document}"
     if not fields and not isinstance(given, Mapping):
         fields = ["fixed"]
     wanted = ".".join(["parameters", f"{state.removesuffix('(0)')}(0)", *fields])
     return (
         f"a start value that is searched is a parameter: --set '{wanted}={value}'. If the model "
-        f"does not search it, {document}"
+        f"does not search it, add --set initial=free, or {document}"
     )
 
 
@@ -389,6 +395,21 @@ def format_estimate(estimate: Mapping[str, Any]) -> str:
     """Format an estimate, ``0.1193 ± 0.0004``, from an entry of a run's parameters."""
     status = str(estimate.get("status", ""))
     return plain_estimate(estimate["value"], estimate["stderr"], status=status)
+
+
+ESTIMATE_HEADINGS = ("parameter", ">estimate", "95 % interval", ">standard error", "unit", "status")
+"""Columns of a table of estimates: those of `sysid.results.summary`."""
+
+
+def list_estimate_cells(estimate: Mapping[str, Any]) -> tuple[str, ...]:
+    """List what is shown of an estimate under `ESTIMATE_HEADINGS`."""
+    stderr, status = estimate["stderr"], str(estimate["status"])
+    value, error = split_estimate(estimate["value"], stderr, status=status)
+    interval = plain_interval(
+        estimate["interval95"], stderr, status=status, open_ends=estimate["open_ends"]
+    )
+    shown = (value, interval or DASH, error or DASH)
+    return estimate["name"], *shown, estimate["unit"], status
 
 
 def read_file(path: Path) -> bytes:

@@ -13,6 +13,7 @@ import typer
 
 from service.cli.common import (
     DATA_HELP,
+    ESTIMATE_HEADINGS,
     MODEL_SUFFIXES,
     OUTPUT_PANEL,
     STANDARD_INPUT,
@@ -29,7 +30,7 @@ from service.cli.common import (
     fail,
     fail_usage,
     file_origins,
-    format_estimate,
+    list_estimate_cells,
     name_file,
     out,
     parse_channels,
@@ -380,16 +381,8 @@ def print_result(
         return
     print_line(f"verdict: {result.verdict.text}")
     print_table(
-        ("parameter", ">estimate ± standard error", "unit", "status"),
-        (
-            (
-                parameter["name"],
-                format_estimate(parameter),
-                parameter["unit"],
-                parameter["status"],
-            )
-            for parameter in document["parameters"]
-        ),
+        ESTIMATE_HEADINGS,
+        map(list_estimate_cells, document["parameters"]),
         empty="no parameters",
     )
     unit = plain_unit(find_output_unit(result))

@@ -10,8 +10,9 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from service.cli.common import (
+    ESTIMATE_HEADINGS,
     FieldOrigins,
-    format_estimate,
+    list_estimate_cells,
     out,
     print_json,
     print_line,
@@ -22,7 +23,7 @@ from service.client.calls import ProblemError
 from service.core.bodies.job_fields import DATASETS_PATH
 from service.core.label_text import format_labels
 from service.trends.trend_text import PLAIN, build_tables, format_reference, list_notes
-from sysid.core.text import DASH, append_unit, join_names, plain_unit
+from sysid.core.text import append_unit, join_names, plain_unit
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -53,17 +54,8 @@ def print_run(run: Mapping[str, Any], as_json: bool) -> None:
     if run["verdict"]:
         print_line(f"verdict: {run['verdict']['text']}")
     print_table(
-        ("parameter", ">estimate ± standard error", "unit", "95 % interval", "status"),
-        [
-            [
-                parameter["name"],
-                format_estimate(parameter),
-                parameter["unit"],
-                _format_interval(parameter),
-                parameter["status"],
-            ]
-            for parameter in run["parameters"]
-        ],
+        ESTIMATE_HEADINGS,
+        map(list_estimate_cells, run["parameters"]),
         empty="no estimates" if run["finished_at"] else "no estimates yet",
     )
     if run["rms"] is not None:
@@ -114,14 +106,6 @@ def _format_fit(run: Mapping[str, Any]) -> str:
 
 def _format_rms(run: Mapping[str, Any], name: str) -> str:
     return f"{run[name]:.6g}{plain_unit(run['rms_unit'])}"
-
-
-def _format_interval(estimate: Mapping[str, Any]) -> str:
-    ends = estimate["interval95"]
-    if ends is None or estimate["status"] == "not settled":
-        return DASH
-    low, high = ("open" if end is None else f"{end:.6g}" for end in ends)
-    return f"{low} to {high}"
 
 
 MAX_PRINTED = 50

@@ -311,7 +311,7 @@ class ComparedValueDocument(TypedDict):
     stderr: float | None
     """standard error, in `unit`. If there is none, `reason` says why"""
     interval95: list[float | None] | None
-    """both ends of the 95 % interval by the t distribution, in `unit`"""
+    """both ends of the 95 % interval, in `unit`"""
     status: Literal[
         "identified",
         "not settled",
@@ -328,6 +328,8 @@ class ComparedValueDocument(TypedDict):
     """identified, or why the value is not to be relied on"""
     reason: str
     """reason of the status, or of a missing standard error; empty if there is nothing to say"""
+    open_ends: list[Literal["lower", "upper"]]
+    """ends of the interval up to which the data speak for any value; there it ends at the bound"""
 
 class ComparisonDocument(TypedDict):
     """Comparison of runs, the best first; `unit` is that of the RMS."""
@@ -545,7 +547,7 @@ class EstimateDocument(TypedDict):
     stderr: float | None
     """standard error, in `unit`. If there is none, `reason` says why"""
     interval95: list[float | None] | None
-    """both ends of the 95 % interval by the t distribution, in `unit`"""
+    """both ends of the 95 % interval, in `unit`"""
     status: Literal[
         "identified",
         "not settled",
@@ -562,6 +564,8 @@ class EstimateDocument(TypedDict):
     """identified, or why the value is not to be relied on"""
     reason: str
     """reason of the status, or of a missing standard error; empty if there is nothing to say"""
+    open_ends: list[Literal["lower", "upper"]]
+    """ends of the interval up to which the data speak for any value; there it ends at the bound"""
 
 class ExperimentDocument(TypedDict):
     """Measured and simulated outputs of one experiment."""
@@ -1245,6 +1249,8 @@ class OrderFitDocument(TypedDict):
     """criterion of Schwarz, smaller is better; with the noise model of the comparison"""
     is_open: bool
     """whether its BIC is within 6 of the lowest: no strong evidence against it"""
+    leaves_noise: bool
+    """whether nothing but noise is left by it. Only of the preferred order this is looked for"""
 
 class OutcomeDocument(TypedDict):
     """Outcome of a job: that of its only run, or of the best one by RMS."""

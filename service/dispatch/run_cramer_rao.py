@@ -11,6 +11,7 @@ The dispatcher computes them when all runs of the job have ended, so that the we
 import logging
 import math
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -37,7 +38,9 @@ from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
 from sysid.data.noise import Noise
 from sysid.models.parse import parse_model
+from sysid.models.starts import compares_starts
 from sysid.simulation.problem import Problem
+from sysid.simulation.start_values import list_starts
 from sysid.uncertainty.cramer_rao import CramerRaoBound, cramer_rao_bound
 from workers.errors import RecordsUnavailable
 from workers.protocol import ProblemSpec
@@ -156,8 +159,10 @@ class _BoundsMaker:
             prepare_run_records(replace(spec, noise=Noise()), records).estimation,
             parameters=dict(_widen_bounds(spec, values)),
             skip=spec.settings.skip,
+            initial=spec.settings.initial,
             weights={output.name: 1.0 for output in model.outputs},
         )
+        problem = _take_rest(problem, values)
         unknown = [name for name in problem.free_names if name not in values]
         if unknown:
             return {"note": f"no Cramér–Rao bound: the value of {', '.join(unknown)} is unknown"}
@@ -168,6 +173,19 @@ class _BoundsMaker:
         theta: FloatArray = np.array([values[name] for name in problem.free_names])
         with use_one_thread():
             return _to_bounds_document(cramer_rao_bound(problem, theta))
+
+
+def _take_rest(problem: Problem, values: Mapping[str, float]) -> Problem:
+    """Take a start at rest if the data decide on it, and the values rest or say nothing of it."""
+    if not compares_starts(problem.given_model, problem.settings.initial):
+        return problem
+    with suppress(SysidError, KeyError):  # the model has no rest, or a value is unknown
+        rest = problem.rebuild(initial="rest")
+        starts = list_starts(rest, np.array([values[name] for name in rest.free_names]))
+        given = [(values.get(name, start), start) for name, start in starts.items()]
+        if all(math.isclose(value, start, rel_tol=1e-9, abs_tol=1e-12) for value, start in given):
+            return rest
+    return problem
 
 
 def _to_bounds_document(bound: CramerRaoBound) -> Document:

@@ -131,7 +131,8 @@ def format_stderr_text(estimate: Estimate) -> str:
 
 def format_interval_text(estimate: Estimate) -> str:
     """Format the 95 % interval of an estimate; empty without one."""
-    return format_interval(estimate.interval95, estimate.stderr, status=estimate.status)
+    status, open_ends = estimate.status, estimate.open_ends
+    return format_interval(estimate.interval95, estimate.stderr, status=status, open_ends=open_ends)
 
 
 def format_bounds_text(estimate: Estimate) -> str:

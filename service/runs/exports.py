@@ -103,7 +103,11 @@ def _list_columns() -> dict[str, str]:
 
 def _list_cells(estimate: Estimate) -> Iterator[object]:
     """List the cells of an estimate; without an error that is shown, it has no interval."""
-    shown = {**encode(estimate), "stderr": find_shown_error(estimate.stderr, estimate.status)}
+    shown = {
+        **encode(estimate),
+        "stderr": find_shown_error(estimate.stderr, estimate.status),
+        "open_ends": " ".join(estimate.open_ends),
+    }
     low, high = (None if shown["stderr"] is None else shown["interval95"]) or (None, None)
     ends = {"interval95_low": low, "interval95_high": high}
     for column, field in _ESTIMATE_COLUMNS.items():

@@ -5,7 +5,7 @@ This module imports the standard library only, so that every command may use it.
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TypeGuard
 
 DASH = "–"
@@ -85,25 +85,70 @@ def join_estimate(value: float, stderr: float | None, *, status: str = "") -> st
     return " ± ".join(filter(None, format_estimate(value, stderr, status=status)))
 
 
-def plain_estimate(value: float, stderr: float | None, *, status: str = "") -> str:
-    """Format an estimate and its error for terminals and notes, readable by programs."""
+def split_estimate(value: float, stderr: float | None, *, status: str = "") -> tuple[str, str]:
+    """Format an estimate and its error for terminals and notes, readable by programs.
+
+    The error is empty where `find_shown_error` finds none.
+    """
     stderr = find_shown_error(stderr, status)
     if not _is_positive(stderr):
-        return f"{value:.6g}"
+        return f"{value:.6g}", ""
     decimals = _estimate_decimals(value, stderr)
     if decimals is None:
-        return f"{value:.6g} ± {stderr:.2g}"
-    return f"{value:.{decimals}f} ± {stderr:.{decimals}f}"
+        return f"{value:.6g}", f"{stderr:.2g}"
+    return f"{value:.{decimals}f}", f"{stderr:.{decimals}f}"
 
 
-def format_interval(ends: Sequence[float] | None, stderr: float | None, *, status: str = "") -> str:
-    """Format a 95 % interval, to the digits of the standard error; empty without one."""
+def plain_estimate(value: float, stderr: float | None, *, status: str = "") -> str:
+    """Join an estimate and its error for terminals and notes, ``0.1193 ± 0.0004``."""
+    return " ± ".join(filter(None, split_estimate(value, stderr, status=status)))
+
+
+def format_interval(
+    ends: Sequence[float | None] | None,
+    stderr: float | None,
+    *,
+    status: str = "",
+    open_ends: Collection[str] = (),
+) -> str:
+    """Format a 95 % interval, to the digits of the standard error; empty without one.
+
+    Of `open_ends`, ``lower`` or ``upper``, only a bound is known: they are "open".
+    """
+    return " … ".join(
+        _write_ends(ends, status, open_ends, lambda end: format_estimate(end, stderr)[0])
+    )
+
+
+def plain_interval(
+    ends: Sequence[float | None] | None,
+    stderr: float | None,
+    *,
+    status: str = "",
+    open_ends: Collection[str] = (),
+) -> str:
+    """Format a 95 % interval as `format_interval` does, for terminals and notes."""
+    return " to ".join(
+        _write_ends(ends, status, open_ends, lambda end: split_estimate(end, stderr)[0])
+    )
+
+
+def _write_ends(
+    ends: Sequence[float | None] | None,
+    status: str,
+    open_ends: Collection[str],
+    write: Callable[[float], str],
+) -> list[str]:
+    """Write both ends of an interval; none without one, and one dash if neither is finite."""
     if ends is None or status in _WITHOUT_ERROR:
-        return ""
-    if not any(map(math.isfinite, ends)):
-        return DASH
-    low, high = (format_estimate(end, stderr)[0] for end in ends)
-    return f"{low} … {high}"
+        return []
+    known = [end is not None and math.isfinite(end) for end in ends]
+    if not any(known):
+        return [DASH]
+    return [
+        "open" if name in open_ends else DASH if end is None or not is_known else write(end)
+        for name, end, is_known in zip(("lower", "upper"), ends, known, strict=True)
+    ]
 
 
 def format_criterion(value: float | None) -> str:

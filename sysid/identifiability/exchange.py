@@ -126,6 +126,15 @@ def order_exchangeable(problem: Problem, theta: FloatArray, groups: ExchangeGrou
     return ordered
 
 
+def find_ordered_partners(
+    groups: ExchangeGroups, theta: FloatArray, d: int
+) -> tuple[list[int], list[int]]:
+    """Find the partners of a parameter that are larger than it in an estimate (D,), and smaller."""
+    columns = [pair for group in groups for pair in zip(*group, strict=True) if d in pair]
+    partners = [(i, theta[i] - theta[d] or d - i) for pair in columns for i in pair if i != d]
+    return [i for i, above in partners if above > 0], [i for i, above in partners if above < 0]
+
+
 def describe_exchanges(
     problem: Problem, groups: ExchangeGroups, reported: set[str]
 ) -> tuple[str, ...]:

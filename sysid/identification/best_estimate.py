@@ -25,10 +25,12 @@ from sysid.islands.run_state import RunState
 from sysid.islands.stopping import count_restarts
 from sysid.judgement.integration_step import (
     HalfStep,
+    can_halve_step,
     choose_starts,
     compare_half_step,
     compute_work_limit,
     find_limit,
+    halve_step,
     mark_changing,
 )
 from sysid.judgement.judge import Explained, explain_residuals
@@ -43,7 +45,7 @@ from sysid.minima.local_minima import (
     LocalMinima,
     count_affordable_simulations,
     find_local_minima,
-    widen_intervals,
+    list_compatible_minima,
 )
 from sysid.minima.minima import (
     Fit,
@@ -71,7 +73,13 @@ from sysid.simulation.problem import Problem
 from sysid.simulation.start_values import convert_point
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
-from sysid.uncertainty.intervals import keep_in_bounds, mark_poor_intervals
+from sysid.uncertainty.intervals import (
+    ProfileEnds,
+    compose_intervals,
+    keep_in_bounds,
+    mark_poor_intervals,
+)
+from sysid.uncertainty.profile_ends import FoundEnds, extrapolate_ends, find_profile_ends
 from sysid.uncertainty.unequal_noise import fit_unequal_noise
 
 _MOST_PROJECTED = 6000  # simulations of a scan by projection
@@ -165,7 +173,8 @@ def find_best_estimate(
 
     The integration step is halved until the estimates and their errors stand still, or until a
     limit is reached. Then those that still change are not identified, or have the change in their
-    errors. If the data decide where the states start, they do so before and after that.
+    errors. If the data decide where the states start, they do so before and after that. With
+    `explains`, intervals follow the profile likelihood where the linear model does not hold.
     """
     refines = is_refining(algorithm, len(state.islands))
     search = _EstimateSearch(problem, state, budget, deadline, refines=refines)
@@ -191,8 +200,11 @@ def find_best_estimate(
     explained = search.explain(explains=explains)
     noise = search.apply_noise_model(explained, is_settled=not changes)
     minima = search.collect_minima(recorded)
-    marked = mark_changing(search.analysis.estimates, half, limit)
-    marked = mark_poor_intervals(search.problem.free_parameters, marked)
+    if explains and refines:
+        search.follow_profiles(noise.theta)
+    parameters = search.problem.free_parameters
+    marked = mark_poor_intervals(parameters, search.analysis.estimates)
+    marked = mark_poor_intervals(parameters, mark_changing(marked, half, limit))
     analysis = replace(search.analysis, estimates=keep_in_bounds(marked))
     return BestEstimate(
         search.problem,
@@ -313,7 +325,7 @@ class _EstimateSearch:
         if self.starts is None:
             return False
         self._budget.spend(self.starts.evaluations)
-        best = self.starts.preferred
+        best = self.starts.best
         if best is self.starts.own or best.name in self._left:
             return False
         self._left.append(self.starts.own.name)
@@ -482,6 +494,38 @@ class _EstimateSearch:
         all_minima = (*minima, *recorded.minima)
         return FoundMinima(all_minima, agreeing, self._projected, recorded.is_contradicted)
 
+    def follow_profiles(self, theta: FloatArray) -> None:
+        """Replace the intervals around an estimate (D,) that those of a linear model miss."""
+        if self._deadline.is_past_grace():
+            return
+        most = count_affordable_simulations(self.problem, self._deadline.is_over())
+        found = find_profile_ends(self.problem, theta, self.analysis, self._budget.cap(most))
+        self._budget.spend(found.evaluations)
+        ends = {**found.by_name, **self._extrapolate_sets(theta, found, most - found.evaluations)}
+        beyond = {
+            name: self.analysis.minima[name].select_beyond(one.interval)
+            for name, one in ends.items()
+            if name in self.analysis.minima
+        }
+        estimates = compose_intervals(self.analysis.estimates, ends, beyond)
+        self.analysis = replace(self.analysis, estimates=estimates)
+
+    def _extrapolate_sets(
+        self, theta: FloatArray, found: FoundEnds, most: int
+    ) -> dict[str, ProfileEnds]:
+        """Extrapolate the ends of sets of values that fit alike to an infinitely fine step."""
+        sets = {name: ends for name, ends in found.by_name.items() if ends.is_set}
+        if not sets or not can_halve_step(self.problem):
+            return {}
+        most = self._budget.cap(most)
+        half = find_profile_ends(halve_step(self.problem), theta, self.analysis, most, sets)
+        self._budget.spend(half.evaluations)
+        return {
+            name: extrapolate_ends(sets[name], ends)
+            for name, ends in half.by_name.items()
+            if ends.is_set
+        }
+
     def _is_late(self) -> bool:
         """Whether no search may begin: the paper's methods have none."""
         return not self._refines or self._deadline.is_past_grace()
@@ -612,18 +656,20 @@ class _EstimateSearch:
 
     def _widen_intervals(self, minima: LocalMinima) -> None:
         """Widen the intervals so that they contain those of all minima."""
-        linear, problem = self.analysis.linear_model, self.problem
-        if linear is None:
+        linear, likelihood = self.analysis.linear_model, self.analysis.likelihood
+        if linear is None or likelihood is None:
             return
+        problem = self.problem
         values = order_exchangeable(problem, minima.values, self.analysis.exchanges)
-        estimates = widen_intervals(
-            self.analysis.estimates,
-            problem.free_parameters,
+        near = list_compatible_minima(
+            problem.free_names,
             problem.n_scored,
             replace(minima, values=values),
             linear.variance_ratio,
+            likelihood.quantiles,
         )
-        self.analysis = replace(self.analysis, estimates=estimates)
+        estimates = compose_intervals(self.analysis.estimates, near)
+        self.analysis = replace(self.analysis, estimates=estimates, minima=near)
 
     def _count_scan_simulations(self) -> int:
         """Count the simulations that a scan may take."""

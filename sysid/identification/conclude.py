@@ -83,7 +83,8 @@ def conclude_run(
     the time of the run is limited, refinement ends near the limit and warnings list what was left
     out. Standard errors, tests and validation are always computed. `clock` returns seconds. With
     `posterior` samples of the posterior are taken, as far as budget and time are left. With
-    `orders` a process with dead time is compared with one order more and one less.
+    `orders` a process with dead time is compared with one order more and one less, and intervals
+    follow the profile likelihood where those of the linear model do not hold.
 
     Raises
     ------

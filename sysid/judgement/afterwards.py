@@ -40,6 +40,7 @@ def explain_afterwards(problem: Problem, result: Result) -> Result:
     if not explained.is_done:
         return result
     tests = result.residual_tests
+    has_feedback = any(one.explanation == "feedback" for one in result.findings)
     still = list(find_unexplained(tests, explained, analysis))
     answered = [one for one in find_unexplained(tests, Explained(), analysis) if one not in still]
     kept = [one for one in result.findings if one not in answered]
@@ -47,7 +48,7 @@ def explain_afterwards(problem: Problem, result: Result) -> Result:
     findings = order_findings(
         [
             *(one for one in kept if one.gain is None),
-            *select_explanations(explained.findings, compared),
+            *select_explanations(() if has_feedback else explained.findings, compared),
         ]
     )
     estimates = conclude_estimates(result.parameters, findings)

@@ -19,7 +19,7 @@ move at the limit is an error of the solver, and is added to the standard error.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import ceil, hypot, inf, log10, sqrt
+from math import ceil, inf, log10, sqrt
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import to_unit
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale
 from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.intervals import IntegrationError, compose_interval
 from sysid.uncertainty.sensitivities import BudgetSpentError, compute_sensitivities
 
 _FACTOR = 2
@@ -88,9 +89,9 @@ def compare_half_step(
     None if there is no such comparison: a recursion, too long a simulation, no sensitivities. One
     simulation is always run. If the budget or the time is over, the change is predicted.
     """
-    if not _can_halve(problem) or analysis.residuals_and_sensitivities is None:
+    if not can_halve_step(problem) or analysis.residuals_and_sensitivities is None:
         return None
-    fine = _halve_step(problem)
+    fine = halve_step(problem)
     error, columns = analysis.residuals_and_sensitivities
     with np.errstate(all="ignore"):  # what diverges with one of the steps
         residual = fine.compute_residuals(theta[None])[0]
@@ -138,7 +139,7 @@ def find_limit(
 ) -> str:
     """Name the limit that forbids a fit with half the step; empty if there is none."""
     fine = half.problem
-    if not _can_halve(fine):
+    if not can_halve_step(fine):
         limit = f"{MAX_SUBSTEPS} substeps or {_MAX_STEPS:,} steps of a simulation"
     elif is_late is not None and is_late():
         limit = "the time limit"
@@ -196,16 +197,7 @@ def _mark_estimate(estimate: Estimate, half: HalfStep, limit: str) -> Estimate:
     if move is None or estimate.stderr is None or estimate.interval95 is None:
         reason = f"half the integration step still changes it: {half.changes[estimate.name]}"
         return replace(estimate, status="unidentifiable", reason=f"{reason}; {limit}")
-    stderr = hypot(estimate.stderr, move)
-    factor = stderr / estimate.stderr
-    lower, upper = (estimate.value + factor * (end - estimate.value) for end in estimate.interval95)
-    return replace(
-        estimate,
-        stderr=stderr,
-        interval95=(lower, upper),
-        reason=f"its error is that of the integration: half the step moves it by {move:.1g}"
-        f"{format_unit(estimate.unit)}, and the record has no noise",
-    )
+    return compose_interval(estimate, IntegrationError(move))
 
 
 def find_finer_step(
@@ -245,7 +237,8 @@ def _spread(champions: Sequence[FloatArray]) -> Sequence[FloatArray]:
     return champions[::-1][::step]
 
 
-def _can_halve(problem: Problem) -> bool:
+def can_halve_step(problem: Problem) -> bool:
+    """Whether half the integration step is possible, and a simulation with it is not too long."""
     return (
         not is_difference(problem.model)
         and _FACTOR * problem.n_steps <= _MAX_STEPS
@@ -253,7 +246,7 @@ def _can_halve(problem: Problem) -> bool:
     )
 
 
-def _halve_step(problem: Problem) -> Problem:
+def halve_step(problem: Problem) -> Problem:
     """Make the same problem with half the integration step."""
     model = problem.given_model
     return problem.rebuild(model=replace_substeps(model, _FACTOR * model.solver.substeps))

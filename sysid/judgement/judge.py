@@ -1,11 +1,12 @@
 """The judge: which explanations of the residuals are more likely than noise, and what they move."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from sysid.core.distributions import chi_square_limit
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.judgement.explanations import (
@@ -21,7 +22,14 @@ from sysid.judgement.explanations.noise import (
     find_disagreement_of_frequencies,
     find_noise,
 )
-from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE, STRONG_ODDS, UNLIKELY_MOVE
+from sysid.judgement.levels import (
+    ADDED_SHARE,
+    BENT_SHARE,
+    DEFECT_GAIN,
+    NOTABLE_MOVE,
+    STRONG_ODDS,
+    UNLIKELY_MOVE,
+)
 from sysid.judgement.residual_context import Candidate, ResidualContext
 from sysid.judgement.residual_model import ColumnFit
 from sysid.results.findings import Finding, Move
@@ -33,9 +41,10 @@ _PROPOSERS = (
     structure.propose,
     history.propose,
     reading.propose,
-    actuator.propose,
-    actuator.propose_loads,
 )
+_COSTLY_PROPOSERS = (actuator.propose, actuator.propose_loads)
+"""Each of their explanations takes a simulation: only if the residuals depend on anything."""
+_LIKELY = 0.01  # of a likelihood ratio: with some forty candidates, of which many are alike
 _MOST_FINDINGS = 3  # that are found beside each other
 _MOST_TOLD = 3  # moves in a sentence
 _MOST_REFITTED = 3  # explanations that are fitted in full
@@ -72,14 +81,15 @@ def explain_residuals(context: ResidualContext) -> Explained:
         return Explained()
     base = context.residual_model.without
     before: ColumnFit | None = None
-    candidates = list(_list_candidates(context))
-    taken = np.zeros((context.times.size, 0))
-    counted = 0
+    taken, counted = np.zeros((context.times.size, 0)), 0
+    candidates = list(_list_candidates(context, _PROPOSERS))
+    scored = _score(context, candidates, taken, counted, base.criterion)
+    if any(_is_likely(one, context.times.size) for one in scored):
+        costly = list(_list_candidates(context, _COSTLY_PROPOSERS))
+        scored += _score(context, costly, taken, counted, base.criterion)
+        scored = _refit_finalists(context, _order(scored), base.criterion)
     findings: list[Finding] = []
     while len(findings) < _MOST_FINDINGS:
-        scored = _score(context, candidates, taken, counted, base.criterion)
-        if not findings:
-            scored = _refit_finalists(context, scored, base.criterion)
         if not scored or scored[0].gain <= DEFECT_GAIN:
             break
         best = scored[0]
@@ -96,6 +106,7 @@ def explain_residuals(context: ResidualContext) -> Explained:
         counted += best.candidate.counted
         base = before = best.fit
         candidates = [one.candidate for one in scored if one.gain > DEFECT_GAIN][1:]
+        scored = _score(context, candidates, taken, counted, base.criterion)
     findings += find_noise(context, base)
     if not findings:
         findings += find_disagreement_of_frequencies(context)
@@ -110,8 +121,18 @@ def _is_possible(context: ResidualContext) -> bool:
     return bool(np.any(error)) and error.size > 2 * columns.shape[1] + 10
 
 
-def _list_candidates(context: ResidualContext) -> Iterator[Candidate]:
-    for propose in _PROPOSERS:
+def _is_likely(scored: _Scored, samples: int) -> bool:
+    """Whether a likelihood ratio test finds a candidate: at 5 % among all, or by its gain."""
+    columns = scored.candidate.columns.shape[1]
+    used = columns + scored.candidate.counted
+    ratio = scored.gain + used * np.log(samples)
+    return scored.gain > 0.0 or ratio > chi_square_limit(used, _LIKELY)
+
+
+def _list_candidates(
+    context: ResidualContext, proposers: Sequence[Callable[[ResidualContext], Iterator[Candidate]]]
+) -> Iterator[Candidate]:
+    for propose in proposers:
         for candidate in propose(context):
             if candidate.columns.any() and np.all(np.isfinite(candidate.columns)):
                 yield candidate
@@ -131,6 +152,11 @@ def _score(
             np.hstack([taken, candidate.columns]), counted + candidate.counted
         )
         scored.append(_Scored(candidate, fit, criterion - fit.criterion))
+    return _order(scored)
+
+
+def _order(scored: Sequence[_Scored]) -> list[_Scored]:
+    """Order by gain, the largest first."""
     return sorted(scored, key=lambda one: -one.gain)
 
 
@@ -157,7 +183,7 @@ def _refit_finalists(
         if gain > one.gain - STRONG_ODDS:
             refitted[position] = one._replace(gain=max(gain, one.gain), moves=found.moves)
     parted = _part_finalist(context, scored, criterion)
-    return sorted([*refitted, *parted], key=lambda one: -one.gain)
+    return _order([*refitted, *parted])
 
 
 def _part_finalist(
@@ -202,7 +228,7 @@ def _describe(
     notable = _list_notable(moves)
     for rival in rivals:
         notable |= _list_notable(context.compute_moves(rival.fit, before, rival.candidate.varies))
-    if candidate.is_vague:
+    if candidate.is_vague or _is_large(context, best):
         notable = {move.parameter for move in moves}
     text = f"{candidate.text}."
     if candidate.describe is not None:
@@ -222,6 +248,15 @@ def _describe(
         moves,
         tuple(move.parameter for move in moves if move.parameter in notable),
     )
+
+
+def _is_large(context: ResidualContext, best: _Scored) -> bool:
+    """Whether an explanation is too large for its moves to be linear: no parameter is safe then.
+
+    What only adds to the output leaves the sensitivities as they are, so it may be larger.
+    """
+    share = ADDED_SHARE if best.candidate.is_added else BENT_SHARE
+    return best.moves is None and best.gain > -np.log1p(-share) * context.times.size
 
 
 def _list_notable(moves: Sequence[Move]) -> set[str]:

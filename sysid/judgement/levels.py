@@ -28,3 +28,12 @@ thousand records is hedged for nothing."""
 
 SOLVER_SHARE = 1e-5
 """Of the output: smaller residuals are the errors of the integration, and no noise."""
+
+BENT_SHARE = 0.25
+"""Of the variance of the residuals. An explanation that takes more, and that changes the response
+itself, is no small change: moves by a linear step are not to be relied on. Measured with
+`benchmarks.judgement`: of crosstalk, curves and missing parts, that left values four errors off."""
+
+ADDED_SHARE = 0.8
+"""The same for what only adds to the output, such as a drift. With larger ones the search itself
+was led astray (`unit_jump` of the benchmark)."""

@@ -30,8 +30,9 @@ from sysid.core.settings import FitSettings, Loss, StartKind
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
+from sysid.judgement.judge import explain_residuals
 from sysid.judgement.levels import SEPARABLE
-from sysid.judgement.residual_context import find_delay_parameters
+from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
 from sysid.models.catalogue.load import load_model
 from sysid.models.catalogue.process_family import Process, ProcessEntry, list_neighbouring_orders
 from sysid.models.model import name_initial_state, replace_substeps
@@ -119,10 +120,11 @@ def compare_orders(
     if len(fits) < 2:
         return None, spent
     has_colour = problem.loss.noise_model == "ar1" or _has_coloured_residuals(fits[-1])
-    compared, bounded = list[OrderFit](), set[str]()
+    compared, contexts, bounded = list[OrderFit](), dict[str, ResidualContext](), set[str]()
     for fitted in fits:
-        order, is_bounded, simulations = _assess_order(fitted, has_colour=has_colour)
+        order, context, is_bounded, simulations = _assess_order(fitted, has_colour=has_colour)
         compared.append(order)
+        contexts[order.model] = context
         bounded |= {order.model} if is_bounded else set()
         spent += simulations
     own = next(
@@ -140,16 +142,35 @@ def compare_orders(
     )
     if bounded & {own, comparison.preferred_model}:
         return None, spent
+    preferred = comparison.preferred_model
+    if preferred is not None and preferred != own:
+        context = contexts[preferred]
+        comparison = _judge_fit(comparison, preferred, context)
+        spent += len(context.spent)
     return comparison, spent
+
+
+def _judge_fit(
+    comparison: OrderComparison, model: str, context: ResidualContext
+) -> OrderComparison:
+    """Judge whether nothing but noise is left by the fit of a model."""
+    leaves_noise = explain_residuals(context).is_noise
+    fits = tuple(
+        replace(fit, leaves_noise=leaves_noise) if fit.model == model else fit
+        for fit in comparison.fits
+    )
+    return replace(comparison, fits=fits)
 
 
 def find_other_orders(
     comparison: OrderComparison | None, model: str, estimates: Sequence[Estimate]
 ) -> Iterator[Finding]:
-    """Find orders that the data prefer, or do not rule out, and that move the dead time.
+    """Find orders that the data prefer, or find as likely, and that move the dead time.
 
-    Orders that are open move it by more than its interval. `model` is the name of the model that
-    was identified.
+    An order that was chosen by one who knows the plant has the odds that would exclude another
+    (`STRONG_ODDS`). So others count if they are as likely by the data. They move the dead time by
+    more than its interval. Another order is advised if nothing but noise is left by it. `model` is
+    the name of the model that was identified.
     """
     if comparison is None or comparison.preferred_model == comparison.model:
         return
@@ -157,7 +178,7 @@ def find_other_orders(
     estimate = next(one for one in estimates if one.name == name)
     others = [fit for fit in comparison.open_fits if fit.model != own.model]
     best = min(others, key=lambda fit: fit.bic)
-    moved = [fit for fit in others if _is_moved(fit, own)]
+    moved = [fit for fit in others if _is_moved(fit, own) and fit.bic < own.bic]
     if comparison.preferred_model is None and not moved:
         return
     listed = ", ".join(_write_delay(comparison, fit) for fit in (own, *others))
@@ -173,7 +194,7 @@ def find_other_orders(
             f"{own.order}): its BIC is {own.bic - best.bic:.3g} lower. {name} is {listed}."
         )
         cure = "Give your model as many time constants, or use" if model != own.model else "Use"
-        advice = f"{cure} the model {best.model}."
+        advice = f"{cure} the model {best.model}." if best.leaves_noise else ""
     yield Finding(
         "order",
         "structure",
@@ -334,7 +355,9 @@ def _has_coloured_residuals(fitted: _FittedOrder) -> bool:
     return any(is_coloured(part, residuals[part.rows]) for part in iterate_parts(fitted.problem))
 
 
-def _assess_order(fitted: _FittedOrder, *, has_colour: bool) -> tuple[OrderFit, bool, int]:
+def _assess_order(
+    fitted: _FittedOrder, *, has_colour: bool
+) -> tuple[OrderFit, ResidualContext, bool, int]:
     """Compute the BIC of a fitted order, its dead time, and whether that is at its bound."""
     problem, theta, spent, whitening = fitted.problem, fitted.theta, fitted.evaluations, None
     if has_colour:
@@ -355,4 +378,5 @@ def _assess_order(fitted: _FittedOrder, *, has_colour: bool) -> tuple[OrderFit, 
         float(np.sqrt(np.mean(np.square(residuals)))),
         criteria.bic,
     )
-    return order, delay.status == "at bound", spent + analysis.evaluations + 1
+    context = ResidualContext(problem, theta, analysis)
+    return order, context, delay.status == "at bound", spent + analysis.evaluations + 1

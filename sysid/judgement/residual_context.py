@@ -24,7 +24,7 @@ from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale
 from sysid.uncertainty.sensitivities import compute_sensitivities
 
-_EDGE_SHARE = 0.05  # of an experiment at either end, in which no change is looked for
+_EDGE_SHARE = 0.1  # of an experiment at either end, in which no change is looked for
 _REFIT_STEPS = 12  # of least squares, from the estimate
 _AFTER = 0.01  # of a period: a held input has jumped then
 _MOST_STATES = 8  # whose starts are looked at
@@ -55,6 +55,8 @@ class Candidate:
         Records with which the model is fitted again, for moves that are not linear.
     is_vague : bool
         Whether it leaves open what the model lacks: then no parameter is safe.
+    is_added : bool
+        Whether it adds to the output whatever the parameters are, such as a drift of the sensor.
     """
 
     explanation: str
@@ -69,6 +71,7 @@ class Candidate:
     moment: float | None = None
     records: Sequence[Record] | None = None
     is_vague: bool = False
+    is_added: bool = False
 
 
 @dataclass(frozen=True, eq=False)

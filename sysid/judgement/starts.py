@@ -118,7 +118,7 @@ class StartComparison:
         return self.fits[0]
 
     @property
-    def preferred(self) -> FittedStart:
+    def best(self) -> FittedStart:
         """The open start of lowest BIC."""
         return min((fit for fit in self.fits if fit.is_open), key=lambda fit: fit.bic)
 

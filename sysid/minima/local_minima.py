@@ -23,16 +23,14 @@ and the position on a plateau where a search ends has no meaning.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from sysid.core.types import FloatArray
-from sysid.models.parameters import Parameter
 from sysid.search.refine import RefinedCandidate, refine_candidate
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.estimates import Estimate
-from sysid.uncertainty.intervals import mark_poor_intervals
+from sysid.uncertainty.intervals import CompatibleMinima
 from sysid.uncertainty.linear_model import LinearOutputModel, factor_covariance, make_move_generator
 
 _DRAW_DEVIATIONS = np.array([0.5, 1.0, 2.0, 3.0])  # standard errors
@@ -197,40 +195,24 @@ class _LocalSearch:
         return starts, self._problem.evaluate_fitness(starts)
 
 
-def widen_intervals(
-    estimates: tuple[Estimate, ...],
-    parameters: Sequence[Parameter],
+def list_compatible_minima(
+    names: Sequence[str],
     n: int,
     minima: LocalMinima,
     variance_ratio: FloatArray,
-) -> tuple[Estimate, ...]:
-    """Widen intervals so that they contain those of all minima that the data do not rule out.
+    quantiles: FloatArray,
+) -> dict[str, CompatibleMinima]:
+    """List the minima with their likelihood ratios, for each of the free parameters' `names`.
 
-    `variance_ratio` (D,) is that of `LinearOutputModel`, for the free `parameters`.
+    `variance_ratio` (D,) is that of `LinearOutputModel`. `quantiles` (D,) are those of the t
+    distribution. A parameter without a variance ratio is left out.
     """
     least = minima.rms.min()
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = 2.0 * n * np.log(np.where(minima.rms > least, minima.rms / least, 1.0))
-    index_by_name = {
-        one.name: d for d, one in enumerate(parameters) if np.isfinite(variance_ratio[d])
+    return {
+        names[d]: CompatibleMinima(
+            minima.values[:, d], ratio * variance_ratio[d], float(quantiles[d])
+        )
+        for d in np.flatnonzero(np.isfinite(variance_ratio)).tolist()
     }
-    widened = [
-        _widen_interval(one, minima.values[:, d], ratio * variance_ratio[d])
-        if (d := index_by_name.get(one.name)) is not None
-        else one
-        for one in estimates
-    ]
-    return mark_poor_intervals(parameters, widened)
-
-
-def _widen_interval(estimate: Estimate, values: FloatArray, ratios: FloatArray) -> Estimate:
-    """Widen an interval by the values (m,) of minima with their likelihood ratios (m,)."""
-    if not estimate.stderr or estimate.interval95 is None:
-        return estimate
-    lower, upper = estimate.interval95
-    quantile = (upper - lower) / (2.0 * estimate.stderr)
-    is_compatible = ratios <= quantile**2
-    half = estimate.stderr * np.sqrt(quantile**2 - ratios[is_compatible])
-    middle = values[is_compatible]
-    low, high = float((middle - half).min()), float((middle + half).max())
-    return replace(estimate, interval95=(min(lower, low), max(upper, high)))

@@ -129,6 +129,8 @@ class OrderFit:
         Criterion of Schwarz, smaller is better; with the noise model of the comparison.
     is_open : bool
         Whether its BIC is within 6 of the lowest: no strong evidence against it.
+    leaves_noise : bool
+        Whether nothing but noise is left by it. Only of the preferred order this is looked for.
     """
 
     model: str
@@ -139,6 +141,7 @@ class OrderFit:
     rms: float
     bic: float
     is_open: bool = True
+    leaves_noise: bool = True
 
 
 @dataclass(frozen=True, slots=True)

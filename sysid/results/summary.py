@@ -9,15 +9,19 @@ from sysid.core.lazy_names import load_library
 from sysid.core.text import (
     DASH,
     format_interval,
-    join_estimate,
     plain_estimate,
+    plain_interval,
     plain_unit,
+    split_estimate,
 )
 from sysid.core.value_documents import list_fields
 from sysid.results.findings import list_untold_reasons
 from sysid.results.parts import OrderComparison, SearchEvidence
 from sysid.results.result import FullResult, Result, find_output_unit
 from sysid.uncertainty.estimates import Estimate
+
+ESTIMATE_HEADINGS = ("parameter", "estimate", "95 % interval", "standard error", "unit", "status")
+"""Columns of each table of estimates, in terminals, notebooks and pages alike."""
 
 _MAX_NOTES = 3
 _BECAUSE = {
@@ -30,15 +34,7 @@ _BECAUSE = {
 def summarise_result(result: FullResult) -> str:
     """Summarise a result in a few lines: verdict, estimates, evidence, the first notes."""
     lines = [", ".join(_list_facts(result)), f"verdict: {result.verdict.text}"]
-    rows = [
-        (
-            estimate.name,
-            plain_estimate(estimate.value, estimate.stderr, status=estimate.status),
-            "" if estimate.unit == "1" else estimate.unit,
-            estimate.status,
-        )
-        for estimate in result.parameters
-    ]
+    rows = [ESTIMATE_HEADINGS, *map(list_estimate_cells, result.parameters)]
     lines += [f"  {'  '.join(cells).rstrip()}" for cells in _align_columns(rows)]
     lines += _list_checks(result)
     notes = _list_notes(result)
@@ -52,7 +48,7 @@ def to_html(result: FullResult) -> str:
     """Write a result as HTML: verdict, estimates, evidence, all notes."""
     head = "".join(
         f"<th style='text-align:left'>{name}</th>"
-        for name in ("Parameter", "Estimate", "Unit", "95 % interval", "Status")
+        for name in map(str.capitalize, ESTIMATE_HEADINGS)
     )
     rows = "".join(f"<tr>{_write_cells(estimate)}</tr>" for estimate in result.parameters)
     facts = "<br>".join(
@@ -96,7 +92,8 @@ def _list_columns(estimate: Estimate) -> Iterator[tuple[str, object]]:
     shown = {"name", "value", "stderr", "interval95", "unit", "status", "lower", "upper"}
     for field in list_fields(Estimate):
         if field.name not in shown:
-            yield field.name, getattr(estimate, field.name)
+            value = getattr(estimate, field.name)
+            yield field.name, " ".join(value) if isinstance(value, tuple) else value
 
 
 def list_evidence(result: Result) -> list[str]:
@@ -185,13 +182,29 @@ def _align_columns(rows: Sequence[tuple[str, ...]]) -> Iterator[list[str]]:
         yield [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
 
 
+def list_estimate_cells(estimate: Estimate) -> tuple[str, ...]:
+    """List what is shown of an estimate under `ESTIMATE_HEADINGS`."""
+    value, stderr, status = estimate.value, estimate.stderr, estimate.status
+    shown, error = split_estimate(value, stderr, status=status)
+    interval = plain_interval(
+        estimate.interval95, stderr, status=status, open_ends=estimate.open_ends
+    )
+    unit = "" if estimate.unit == "1" else estimate.unit
+    return estimate.name, shown, interval or DASH, error or DASH, unit, status
+
+
 def _write_cells(estimate: Estimate) -> str:
-    interval = format_interval(estimate.interval95, estimate.stderr, status=estimate.status) or DASH
+    value, stderr, status = estimate.value, estimate.stderr, estimate.status
+    shown, error = format_estimate(value, stderr, status=status)
+    interval = format_interval(
+        estimate.interval95, stderr, status=status, open_ends=estimate.open_ends
+    )
     cells = (
         f"<b>{escape(estimate.name)}</b>",
-        escape(join_estimate(estimate.value, estimate.stderr, status=estimate.status)),
+        shown,
+        interval or DASH,
+        error or DASH,
         "" if estimate.unit == "1" else escape(estimate.unit),
-        escape(interval),
-        escape(estimate.status),
+        escape(status),
     )
     return "".join(f"<td style='text-align:left'>{cell}</td>" for cell in cells)

@@ -23,7 +23,8 @@ data do not identify follow from the singular values of S. Both give groups
 (`sysid.identifiability.combinations`).
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -54,7 +55,7 @@ from sysid.uncertainty.estimates import (
     NoiseColour,
     Uncertainty,
 )
-from sysid.uncertainty.intervals import LocalStatistics, make_estimates
+from sysid.uncertainty.intervals import CompatibleMinima, Plateau, compose_intervals
 from sysid.uncertainty.likelihood import LikelihoodModel
 from sysid.uncertainty.linear_model import LinearOutputModel, linearise_outputs
 from sysid.uncertainty.local_algebra import (
@@ -64,6 +65,7 @@ from sysid.uncertainty.local_algebra import (
     invert_squared,
     scale_matrix,
 )
+from sysid.uncertainty.local_estimates import LocalStatistics, make_estimates
 from sysid.uncertainty.sensitivities import BudgetSpentError, Sensitivities, compute_sensitivities
 
 
@@ -104,6 +106,8 @@ class Analysis:
     """Of the sensitivities, whitened or not. None: no uncertainty."""
     likelihood: LikelihoodModel | None = None
     """None if there is no uncertainty."""
+    minima: Mapping[str, CompatibleMinima] = field(default_factory=dict)
+    """Minima near the estimate that widen the intervals, by parameter."""
 
 
 def analyse_estimate(
@@ -222,11 +226,12 @@ def _analyse_sensitivities(
     statuses = _classify_parameters(
         point, blocks, is_pulled, np.array([name in combined for name in names])
     )
+    quantiles = np.array([student_limit(each, 0.025) for each in degrees.tolist()])
     statistics = LocalStatistics(
         theta,
         statuses,
         physical,
-        np.array([student_limit(each, 0.025) for each in degrees.tolist()]),
+        quantiles,
         directions.is_null_member,
         uncertainty.groups,
         rows[~retained],
@@ -252,7 +257,9 @@ def _analyse_sensitivities(
         active_bounds,
         linear,
         decomposition=decomposition,
-        likelihood=LikelihoodModel(error, columns, middle, uncertainty.degrees, whitening),
+        likelihood=LikelihoodModel(
+            error, columns, middle, uncertainty.degrees, quantiles, whitening
+        ),
     )
 
 
@@ -321,35 +328,21 @@ def _correct_for_jumps(
     """Correct the estimates of parameters with which the output changes in jumps only."""
     names = problem.free_names
     blind = {name for name, jumps in zip(names, one_sided, strict=True) if jumps}
-    offsets = {
-        name: float(offset) for name, offset in zip(names, plateau_offset, strict=True) if offset
+    plateaus = {
+        name: Plateau(float(offset))
+        for name, offset in zip(names, plateau_offset, strict=True)
+        if offset
     }
-    corrected = (
+    corrected = [
         _remove_stderr(estimate) if estimate.name in blind else estimate for estimate in estimates
-    )
-    return tuple(
-        _centre_on_plateau(estimate, offsets[estimate.name])
-        if estimate.name in offsets
-        else estimate
-        for estimate in corrected
-    )
+    ]
+    return compose_intervals(corrected, plateaus)
 
 
 def _remove_stderr(estimate: Estimate) -> Estimate:
     """Remove the standard error if the output jumps on one side of the estimate only."""
     reason = "the output changes with it in jumps, and here on one side only"
     return replace(estimate, stderr=None, interval95=None, reason=reason)
-
-
-def _centre_on_plateau(estimate: Estimate, plateau_offset: float) -> Estimate:
-    """Centre the interval of an estimate on its plateau, whose middle is `plateau_offset` above it.
-
-    The loss is constant on a plateau, so the position where the search ended has no meaning.
-    """
-    if estimate.interval95 is None:
-        return estimate
-    lower, upper = estimate.interval95
-    return replace(estimate, interval95=(lower + plateau_offset, upper + plateau_offset))
 
 
 def _compute_possible_gain(

@@ -8,6 +8,7 @@ from sysid.core.types import FloatArray
 from sysid.identifiability.combinations import IdentifiableCombination
 
 NoiseColour = Literal["white", "first-order", "coloured", "drifting", "clustered"]
+IntervalEnd = Literal["lower", "upper"]
 EstimateStatus = Literal[
     "identified",
     "not settled",
@@ -42,11 +43,13 @@ class Estimate:
     stderr : float or None
         Standard error, in `unit`. If there is none, `reason` says why.
     interval95 : tuple of float or None
-        Both ends of the 95 % interval by the t distribution, in `unit`.
+        Both ends of the 95 % interval, in `unit`.
     status : EstimateStatus
         Identified, or why the value is not to be relied on.
     reason : str
         Reason of the status, or of a missing standard error; empty if there is nothing to say.
+    open_ends : tuple of IntervalEnd
+        Ends of the interval up to which the data speak for any value; there it ends at the bound.
 
     Examples
     --------
@@ -64,6 +67,7 @@ class Estimate:
     interval95: tuple[float, float] | None
     status: EstimateStatus
     reason: str = ""
+    open_ends: tuple[IntervalEnd, ...] = ()
 
     @property
     def is_free(self) -> bool:

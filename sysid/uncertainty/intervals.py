@@ -1,72 +1,319 @@
-"""Estimates of free, fixed and tied parameters from the local analysis."""
+"""The 95 % interval of an estimate: the only module that makes one or changes it.
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from math import log, sqrt
+`compose_interval` takes what is known of an estimate, one source after the other:
+
+`LocalInterval`
+    The interval of the t distribution, from the standard error of the local analysis.
+`Plateau`
+    Values that all give the same output: where the search ended among them has no meaning.
+`CompatibleMinima`
+    Other minima that the data do not rule out (Venzon and Moolgavkar 1988).
+`IntegrationError`
+    The move by half an integration step, beside which the noise is small.
+`ProfileEnds`
+    The ends of the profile likelihood, where a local interval does not hold. An end may be open.
+`Mixture`
+    Alternatives with their weights, such as other explanations of the residuals (Bayesian model
+    averaging; Hoeting, Madigan, Raftery and Volinsky, Statist. Sci. 14 (1999) 382).
+"""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from math import hypot, inf, log, sqrt
+from typing import Protocol, get_args
 
 import numpy as np
 
-from sysid.core.types import BoolArray, FloatArray
-from sysid.identifiability.combinations import IdentifiableCombination
-from sysid.language.evaluation import evaluate_expression
+from sysid.core.distributions import student_limit, student_tail
+from sysid.core.text import split_estimate
+from sysid.core.types import FloatArray
+from sysid.core.units import format_unit
 from sysid.language.functions import Interval
-from sysid.language.tree import Expression
 from sysid.models.parameters import Parameter
-from sysid.simulation.problem import Problem
-from sysid.uncertainty.estimates import Estimate, EstimateStatus
+from sysid.uncertainty.estimates import Estimate, EstimateStatus, IntervalEnd
 
-_TIE_STEP = 1e-6  # of the range: slopes of ties
-_NULL_SHARE = 1e-4  # share of a tie's slope along directions that have no effect
-_MAX_NAMED_GROUPS = 4  # groups that a reason names
+_TAIL = 0.025  # of the distribution, beyond each end of an interval
 _POOR_SHARE = 1 / 3  # of a range: an interval around 0 that covers more says little
+_ENDS: tuple[IntervalEnd, ...] = get_args(IntervalEnd)
+_HALVINGS = 60  # of the range of a quantile: to the resolution of a number
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LocalStatistics:
-    """Result of the local analysis.
+class IntervalSource(Protocol):
+    """What is known of an estimate, and what follows for its interval."""
+
+    @abstractmethod
+    def apply(self, estimate: Estimate) -> Estimate:
+        """Return the estimate with the interval that follows."""
+
+
+def compose_interval(estimate: Estimate, *sources: IntervalSource) -> Estimate:
+    """Compose the interval of an estimate from these sources, in their order.
+
+    Each source changes the interval that those before it have left.
+    """
+    for source in sources:
+        estimate = source.apply(estimate)
+    return estimate
+
+
+def compose_intervals(
+    estimates: Sequence[Estimate], *sources: Mapping[str, IntervalSource]
+) -> tuple[Estimate, ...]:
+    """Compose the intervals of the estimates that have such sources, by name."""
+    return tuple(
+        compose_interval(one, *(by_name[one.name] for by_name in sources if one.name in by_name))
+        for one in estimates
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class LocalInterval:
+    """The interval of the local analysis, by Wald: value ± quantile · standard error.
 
     Attributes
     ----------
-    theta : FloatArray, shape (D,)
-    statuses : tuple of EstimateStatus
-    covariance : FloatArray, shape (D, D)
-        In the parameters' units.
-    t_quantile : FloatArray, shape (D,)
+    quantile : float
         Of the t distribution, for 95 %.
-    lacks_stderr : BoolArray, shape (D,)
-        Parameters without a standard error.
-    groups : tuple of IdentifiableCombination
-    null_directions : FloatArray, shape (m, D)
-        Directions without effect, in unit coordinates p.
-    scale : FloatArray, shape (D,)
-        ∂θ/∂p.
-    reason : str
-        Why no parameter has a standard error; empty if some have one.
     """
 
-    theta: FloatArray
-    statuses: tuple[EstimateStatus, ...]
-    covariance: FloatArray
-    t_quantile: FloatArray
-    lacks_stderr: BoolArray
-    groups: tuple[IdentifiableCombination, ...]
-    null_directions: FloatArray
-    scale: FloatArray
-    reason: str = ""
+    quantile: float
+
+    def apply(self, estimate: Estimate) -> Estimate:
+        """Give an estimate that has a standard error its interval."""
+        if estimate.stderr is None:
+            return estimate
+        half = self.quantile * estimate.stderr
+        return replace(estimate, interval95=(estimate.value - half, estimate.value + half))
 
 
-def make_estimates(problem: Problem, statistics: LocalStatistics) -> tuple[Estimate, ...]:
-    """Make the estimates of all parameters in the problem's order."""
-    free = {
-        p.name: _make_free_estimate(p, statistics, d) for d, p in enumerate(problem.free_parameters)
-    }
-    return mark_poor_intervals(
-        problem.free_parameters,
-        tuple(
-            free.get(p.name) or _make_fixed_or_tied_estimate(problem, statistics, p)
-            for p in problem.all_parameters
-        ),
-    )
+@dataclass(frozen=True, slots=True)
+class Plateau:
+    """Values on which the output does not change.
+
+    Attributes
+    ----------
+    offset : float
+        Distance from the estimate up to the middle of the plateau, in the parameter's unit.
+    """
+
+    offset: float
+
+    def apply(self, estimate: Estimate) -> Estimate:
+        """Centre the interval on the plateau."""
+        if estimate.interval95 is None:
+            return estimate
+        lower, upper = estimate.interval95
+        return replace(estimate, interval95=(lower + self.offset, upper + self.offset))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CompatibleMinima:
+    """Minima beside the estimate, which may be as likely.
+
+    Attributes
+    ----------
+    values : FloatArray, shape (m,)
+        The parameter's values there, in its unit.
+    ratios : FloatArray, shape (m,)
+        Likelihood ratios to the best of them, scaled to follow χ² with one degree of freedom.
+    quantile : float
+        Of the t distribution, for 95 %.
+    """
+
+    values: FloatArray
+    ratios: FloatArray
+    quantile: float
+
+    def select_beyond(self, ends: Interval) -> "CompatibleMinima":
+        """Select the minima outside an interval."""
+        is_beyond = (self.values < ends[0]) | (self.values > ends[1])
+        return replace(self, values=self.values[is_beyond], ratios=self.ratios[is_beyond])
+
+    def apply(self, estimate: Estimate) -> Estimate:
+        """Widen the interval by those of the minima whose ratio is below the quantile squared.
+
+        With the curvature of the best minimum, each one covers √(quantile² - ratio) standard
+        errors.
+        """
+        is_compatible = self.ratios <= self.quantile**2
+        if not estimate.stderr or estimate.interval95 is None or not is_compatible.any():
+            return estimate
+        lower, upper = estimate.interval95
+        half = estimate.stderr * np.sqrt(self.quantile**2 - self.ratios[is_compatible])
+        middle = self.values[is_compatible]
+        low, high = float((middle - half).min()), float((middle + half).max())
+        return replace(estimate, interval95=(min(lower, low), max(upper, high)))
+
+
+@dataclass(frozen=True, slots=True)
+class IntegrationError:
+    """The error of the integration, in a record without noise.
+
+    Attributes
+    ----------
+    move : float
+        By half the integration step, in the parameter's unit.
+    """
+
+    move: float
+
+    def apply(self, estimate: Estimate) -> Estimate:
+        """Add the move to the standard error, and widen the interval by as much."""
+        if not estimate.stderr or estimate.interval95 is None:
+            return estimate
+        stderr, value = hypot(estimate.stderr, self.move), estimate.value
+        factor = stderr / estimate.stderr
+        lower, upper = (value + factor * (end - value) for end in estimate.interval95)
+        reason = (
+            f"its error is that of the integration: half the step moves it by {self.move:.1g}"
+            f"{format_unit(estimate.unit)}, and the record has no noise"
+        )
+        return replace(estimate, stderr=stderr, interval95=(lower, upper), reason=reason)
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileEnds:
+    """Ends by the profile likelihood (`sysid.uncertainty.profile_ends`).
+
+    Attributes
+    ----------
+    interval : tuple of float
+        In the parameter's unit.
+    limits : mapping of IntervalEnd to str
+        For each open end the parameter whose bound stops it: no data do. Mostly it is its own.
+    is_closed : bool
+        Whether the data end it on both sides.
+    is_set : bool
+        Whether values around the estimate all give the same output.
+    """
+
+    interval: Interval
+    limits: Mapping[IntervalEnd, str] = field(default_factory=dict)
+    is_closed: bool = True
+    is_set: bool = False
+
+    def apply(self, estimate: Estimate) -> Estimate:
+        """Replace the interval, and the status if that of the linear model does not hold.
+
+        A parameter is practically identifiable if its profile is closed, and not if an end is open
+        (Raue et al., Bioinformatics 25 (2009) 1923). If that end is towards 0, it is still known
+        how large the parameter may be, as of any interval that holds 0.
+        """
+        found = replace(estimate, interval95=self.interval, open_ends=tuple(self.limits))
+        is_flat = self.is_closed and estimate.status == "unidentifiable"
+        if self.is_set or is_flat:  # in the worst case all values are as likely
+            stderr = (self.interval[1] - self.interval[0]) / sqrt(12.0)
+            found = replace(found, stderr=stderr)
+        if is_flat:
+            found = replace(found, status="identified", reason="")
+        if found.status != "identified":
+            return found
+        if self.limits:
+            ends = dict(zip(_ENDS, self.interval, strict=True))
+            is_unlimited = any(abs(ends[name]) > abs(estimate.value) for name in self.limits)
+            status: EstimateStatus = "unidentifiable" if is_unlimited else "identified"
+            return replace(found, status=status, reason=self._describe_limits(estimate))
+        if self.is_set:
+            low, high = (split_estimate(end, found.stderr)[0] for end in self.interval)
+            unit = format_unit(estimate.unit)
+            reason = f"it lies between {low}{unit} and {high}{unit}, where all values fit alike"
+            return replace(found, reason=reason)
+        return found
+
+    def _describe_limits(self, estimate: Estimate) -> str:
+        low, high = (f"{end:.4g}{format_unit(estimate.unit)}" for end in self.interval)
+        if len(self.limits) > 1:
+            return f"open below and above: all values from {low} to {high} fit"
+        ((end, name),) = self.limits.items()
+        side, start, stop = ("above", low, high) if end == "upper" else ("below", high, low)
+        way = "up" if end == "upper" else "down"
+        if name == estimate.name:
+            return f"open {side}: all values from {start} {way} to its bound {stop} fit"
+        values = f"all values from {start} {way} to {stop} fit"
+        return f"open {side}: {values}, where {name} meets its bound"
+
+
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """One of several estimates of a parameter: Student's t distribution around a value.
+
+    Attributes
+    ----------
+    weight : float
+        Share of the probability, in any unit that all alternatives have in common.
+    value, stderr : float
+        In the parameter's unit.
+    degrees : float
+        Degrees of freedom; infinite: the normal distribution.
+    """
+
+    weight: float
+    value: float
+    stderr: float
+    degrees: float = inf
+
+    def compute_tail(self, value: float) -> float:
+        """Compute the probability that the parameter exceeds a value."""
+        if self.stderr > 0.0:
+            return student_tail(self.degrees, (value - self.value) / self.stderr)
+        return float(self.value > value)
+
+
+@dataclass(frozen=True, slots=True)
+class Mixture:
+    """Estimates by alternatives that the data leave open, such as explanations of residuals."""
+
+    alternatives: tuple[Alternative, ...]
+
+    def apply(self, estimate: Estimate) -> Estimate:
+        """Replace the interval by that of the mixture."""
+        return replace(estimate, interval95=compute_mixture_interval(self.alternatives))
+
+
+def compute_mixture_interval(alternatives: Sequence[Alternative]) -> Interval:
+    """Compute the 2.5 and 97.5 % quantiles of a mixture of t distributions.
+
+    The posterior of a parameter under several models is the mixture of those under each of them,
+    by the models' probabilities (Hoeting et al. 1999, eq. 1). Only relative weights count.
+
+    Raises
+    ------
+    ValueError
+        If no alternative has a positive, finite weight, or if one has a negative weight or error.
+
+    Examples
+    --------
+    >>> one, other = Alternative(0.75, 1.0, 0.1), Alternative(0.25, 2.0, 0.1)
+    >>> low, high = compute_mixture_interval([one, other])
+    >>> round(low, 3), round(high, 3)
+    (0.817, 2.128)
+    """
+    total = sum(one.weight for one in alternatives)
+    if not 0.0 < total < inf or any(one.weight < 0.0 or one.stderr < 0.0 for one in alternatives):
+        raise ValueError("a mixture needs weights and errors of 0 or more, and a weight above 0")
+    open_ones = [one for one in alternatives if one.weight > 0.0]
+    low, high = (_find_quantile(open_ones, total, tail) for tail in (1.0 - _TAIL, _TAIL))
+    return low, high
+
+
+def _find_quantile(alternatives: Sequence[Alternative], total: float, tail: float) -> float:
+    """Find the value that the mixture exceeds with a probability, by bisection.
+
+    It lies between the least and the largest of those of the alternatives.
+    """
+    ends = [
+        one.value + one.stderr * student_limit(one.degrees, tail) if one.stderr else one.value
+        for one in alternatives
+    ]
+    low, high = min(ends), max(ends)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        if sum(one.weight * one.compute_tail(middle) for one in alternatives) > tail * total:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
 
 
 def mark_poor_intervals(
@@ -118,99 +365,3 @@ def _explain_poor_interval(parameter: Parameter, interval: Interval) -> str:
     if interval[0] <= 0.0 <= interval[1] and share > _POOR_SHARE:
         return f"{poorly} contains 0, and {100 * share:.0f} % of its range"
     return ""
-
-
-def _make_free_estimate(parameter: Parameter, statistics: LocalStatistics, d: int) -> Estimate:
-    value, status = float(statistics.theta[d]), statistics.statuses[d]
-    lacks_stderr = bool(statistics.lacks_stderr[d])
-    reason = statistics.reason or _explain_status(
-        parameter.name, status, lacks_stderr, statistics.groups
-    )
-    error = None if lacks_stderr else sqrt(max(float(statistics.covariance[d, d]), 0.0))
-    quantile = float(statistics.t_quantile[d])
-    return _make_estimate(parameter, value, error, quantile, status, reason)
-
-
-def _make_fixed_or_tied_estimate(
-    problem: Problem, statistics: LocalStatistics, parameter: Parameter
-) -> Estimate:
-    if parameter.name not in problem.ties:
-        value = parameter.fixed or 0.0
-        return _make_estimate(parameter, value, None, 0.0, "fixed", "its value was given")
-    tree, reason = problem.ties[parameter.name], f"tied to {parameter.tied}"
-    value, slope = _linearise_tie(problem, tree, statistics.theta, statistics.scale)
-    null_part = statistics.null_directions @ (slope * statistics.scale)
-    if np.linalg.norm(null_part) > _NULL_SHARE * np.linalg.norm(slope * statistics.scale):
-        why = statistics.reason or "the data do not determine what it is tied to"
-        return _make_estimate(parameter, value, None, 0.0, "tied", f"{reason}; {why}")
-    error = sqrt(max(float(slope @ statistics.covariance @ slope), 0.0))
-    quantile = float(np.max(statistics.t_quantile[slope != 0.0], initial=0.0))
-    return _make_estimate(parameter, value, error, quantile, "tied", reason)
-
-
-def _linearise_tie(
-    problem: Problem, tree: Expression, theta: FloatArray, scale: FloatArray
-) -> tuple[float, FloatArray]:
-    """Compute a tied parameter and its slopes in the free ones, by central differences."""
-    fixed_values = {p.name: p.fixed for p in problem.all_parameters if p.fixed is not None}
-
-    def evaluate_at(values: FloatArray) -> float:
-        return evaluate_expression(
-            tree, {**fixed_values, **dict(zip(problem.free_names, values.tolist(), strict=True))}
-        )
-
-    steps = np.diag(_TIE_STEP * scale)
-    slope = [
-        (evaluate_at(theta + step) - evaluate_at(theta - step)) / (2.0 * step.sum())
-        for step in steps
-    ]
-    return evaluate_at(theta), np.array(slope)
-
-
-def _explain_status(
-    name: str,
-    status: EstimateStatus,
-    lacks_stderr: bool,
-    groups: tuple[IdentifiableCombination, ...],
-) -> str:
-    """Explain why there is no standard error, or its limits."""
-    if status == "group":
-        expressions = [group.text for group in groups if name in group.members]
-        more = ", …" if len(expressions) > _MAX_NAMED_GROUPS else ""
-        others = f": {', '.join(expressions[:_MAX_NAMED_GROUPS])}{more}" if expressions else ""
-        if lacks_stderr:
-            return f"only a combination with other parameters has an effect on the output{others}"
-        return (
-            "these data determine it poorly, apart from a combination with other "
-            f"parameters{others}"
-        )
-    if lacks_stderr:
-        return "the output does not change with it"
-    return {
-        "unidentifiable": "these data determine it poorly: its standard error is as large as "
-        "its range",
-        "at bound": "it lies at its bound; the standard error is that of the linear model",
-    }.get(status, "")
-
-
-def _make_estimate(
-    parameter: Parameter,
-    value: float,
-    stderr: float | None,
-    quantile: float,
-    status: EstimateStatus,
-    reason: str,
-) -> Estimate:
-    half = None if stderr is None else quantile * stderr
-    interval = None if half is None else (value - half, value + half)
-    return Estimate(
-        parameter.name,
-        parameter.unit,
-        value,
-        parameter.lower,
-        parameter.upper,
-        stderr,
-        interval,
-        status,
-        reason,
-    )

@@ -18,6 +18,7 @@ least number of degrees of freedom of all intervals.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,6 +45,8 @@ class LikelihoodModel:
         Ω, widened for the degrees of freedom; None for white residuals of squares.
     degrees : float
         Degrees of freedom.
+    quantiles : FloatArray, shape (D,)
+        Of the t distribution, for the 95 % interval of each parameter.
     whitening : Whitening or None
     """
 
@@ -51,7 +54,24 @@ class LikelihoodModel:
     columns: FloatArray
     middle: FloatArray | None
     degrees: float
+    quantiles: FloatArray
     whitening: Whitening | None = None
+
+
+class LinearRatio(NamedTuple):
+    """Q around a point: ratio + abs(residuals + columns · move)² - abs(residuals)².
+
+    Attributes
+    ----------
+    ratio : float
+        Q at the point.
+    residuals : FloatArray, shape (m,)
+    columns : FloatArray, shape (m, D)
+    """
+
+    ratio: float
+    residuals: FloatArray
+    columns: FloatArray
 
 
 class Likelihood:
@@ -97,6 +117,26 @@ class Likelihood:
             moves = (residuals - self._model.residuals) @ self._projection.T
             ratios = self._share * (loss - self._loss) + np.square(moves) @ self._correction
         return np.where(np.isfinite(ratios), ratios, np.inf)
+
+    def linearise_ratio(self, residuals: FloatArray, columns: FloatArray) -> LinearRatio:
+        """Linearise Q at a point with these weighted residuals (n,) and slopes (n, D).
+
+        They are not whitened yet. Soft-l1 counts by its weights there.
+        """
+        whitening, scale = self._model.whitening, self._problem.loss_scale
+        if whitening is not None:
+            residuals, columns = whitening.whiten(residuals), whitening.whiten(columns.T).T
+        moves = self._projection @ (residuals - self._model.residuals)
+        loss = float(np.sum(compute_loss(residuals, scale)))
+        root = np.sqrt(self._share * compute_loss_weight(residuals, scale)) * np.ones(
+            len(residuals)
+        )
+        own = np.sqrt(self._correction)
+        return LinearRatio(
+            self._share * (loss - self._loss) + float(self._correction @ np.square(moves)),
+            np.concatenate([root * residuals, own * moves]),
+            np.vstack([root[:, None] * columns, own[:, None] * (self._projection @ columns)]),
+        )
 
     def to_logarithms(self, ratios: FloatArray) -> FloatArray:
         """Convert Q (P,) to the logarithm of the likelihood; below 0 by its tangent there."""

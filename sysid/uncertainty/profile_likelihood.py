@@ -26,7 +26,12 @@ import numpy as np
 from sysid.core.distributions import CHI_SQUARE_95
 from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
 from sysid.core.types import FloatArray
-from sysid.identifiability.exchange import ExchangeGroups, find_exchanges, order_exchangeable
+from sysid.identifiability.exchange import (
+    ExchangeGroups,
+    find_exchanges,
+    find_ordered_partners,
+    order_exchangeable,
+)
 from sysid.residuals.sandwich import estimate_sandwich
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.simulation.loss import compute_influence
@@ -165,10 +170,7 @@ class _ProfileSearch:
         should_stop: Callable[[], bool] | None,
     ) -> None:
         self._problem, self._d, self._should_stop = problem, d, should_stop
-        columns = [pair for group in groups for pair in zip(*group, strict=True) if d in pair]
-        partners = [(i, theta[i] - theta[d] or d - i) for pair in columns for i in pair if i != d]
-        self._larger = [i for i, above in partners if above > 0]
-        self._smaller = [i for i, above in partners if above < 0]
+        self._larger, self._smaller = find_ordered_partners(groups, theta, d)
         self.is_stopped, self.evaluations = False, 1
         self._position = float(to_unit(problem.evaluator, theta[None])[0, d])
         rms = float(problem.evaluate_fitness(theta[None])[0])

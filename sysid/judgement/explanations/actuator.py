@@ -162,6 +162,14 @@ def _list_changes(name: str, low: float, high: float, span: float) -> Iterator[_
 
 
 def _list_smoothings(name: str) -> Iterator[_Change]:
+    yield _Change(
+        _round_to_levels,
+        "noise of an input",
+        "input",
+        f"{name} was recorded with noise",
+        f"the levels between which {name} steps explain the output better than {name} itself: its "
+        "record has noise that does not act on the plant",
+    )
     for width, smooth in product(_WIDTHS, (_smooth, _take_medians, _keep_edges)):
         yield _Change(
             partial(smooth, width=width),
@@ -171,6 +179,18 @@ def _list_smoothings(name: str) -> Iterator[_Change]:
             f"a mean of {name} over {width} samples explains the output better than {name} itself: "
             "its record has noise or steps of a converter that do not act on the plant",
         )
+
+
+def _round_to_levels(values: FloatArray) -> FloatArray:
+    """Round values to the means of their clusters, between which nothing lies (single linkage)."""
+    order = np.argsort(values, kind="stable")
+    gaps = np.diff(values[order])
+    deviation = 1.4826 * float(np.median(np.abs(np.diff(values)))) / np.sqrt(2.0)
+    numbers = np.concatenate([[0], np.cumsum(gaps > deviation)])
+    means = np.bincount(numbers, values[order]) / np.bincount(numbers)
+    rounded = np.empty(values.size)
+    rounded[order] = means[numbers]
+    return rounded
 
 
 def _bend(values: FloatArray, middle: float, span: float, power: int) -> FloatArray:

@@ -37,6 +37,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             "the record does not start as the model says",
             f"the record does not start where the model says that {', '.join(states)} does",
             "Use initial: free.",
+            is_added=True,
         )
 
 
@@ -64,6 +65,7 @@ def _propose_restarts(context: ResidualContext) -> Iterator[Candidate]:
                 "Identify both parts by themselves: give each a label in a column for --segments.",
                 counted=1,
                 moment=moment,
+                is_added=True,
             )
 
 
@@ -85,6 +87,7 @@ def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:
                 f"{name} moved before the record",
                 f"{name} was not at its first value before the record, as is assumed",
                 "Begin the record earlier, or leave its first samples out with skip.",
+                is_added=True,
             )
 
 

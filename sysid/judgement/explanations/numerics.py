@@ -35,4 +35,5 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             "the integration step is long",
             "the residuals show errors of the integration",
             f"Set substeps: {steps} in the solver of the model's document.",
+            is_added=True,
         )

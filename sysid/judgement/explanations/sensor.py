@@ -39,6 +39,7 @@ def _propose_courses(context: ResidualContext, name: str, rows: BoolArray) -> It
         f"{name} drifts",
         f"{name} drifts in a straight line beside the model",
         f"Add drift*t to output {name} in the model's document, and drift to its parameters.",
+        is_added=True,
     )
     for moment, late, where in context.find_breaks(context.weigh(np.where(rows, 1.0, 0.0))[:, 0]):
         yield Candidate(
@@ -50,6 +51,7 @@ def _propose_courses(context: ResidualContext, name: str, rows: BoolArray) -> It
             "Identify both parts by themselves: give each a label in a column for --segments.",
             counted=1,
             moment=moment,
+            is_added=True,
         )
         after = np.where((late != 0) & (times >= moment), simulated, 0.0)
         yield Candidate(

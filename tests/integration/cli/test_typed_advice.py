@@ -138,18 +138,19 @@ def test_the_advice_about_a_start_can_be_typed(data: Path, change: str) -> None:
     assert "the model's document, which lagid models show prints" in word
 
 
-def test_a_start_that_a_built_in_model_measures_is_searched_by_a_document(
+def test_a_start_that_a_built_in_model_measures_is_searched_by_a_setting_or_a_document(
     data: Path, tmp_path: Path
 ) -> None:
-    words = ("--channels", "y=temp", "--set", "initial.x={lower: -1, upper: 1}")
-    refusal = run_lagid("identify", data, "--model", "mackey-glass", *words).stderr
-    assert "If the model does not search it, write it into the model's document" in refusal
-    document = parse_yaml(run_lagid("models", "show", "mackey-glass").stdout.encode())
-    document["initial"]["x"] = {"lower": -1, "upper": 1}
+    words = ("--channels", "u=heat,y=temp", "--set", "initial.y={lower: -1, upper: 1}")
+    refusal = run_lagid("identify", data, "--model", "tube", *words).stderr
+    assert "If the model does not search it, add --set initial=free, or write it into" in refusal
+    document = parse_yaml(run_lagid("models", "show", "tube").stdout.encode())
+    document["initial"]["y"] = {"lower": -1, "upper": 1}
     model = tmp_path / "mine.json"
     model.write_text(json.dumps(document))
-    done = run_lagid("identify", data, "--model", model, *words[:2], *QUICK, "--json")
-    assert "x(0)" in {one["name"] for one in json.loads(done.stdout)["parameters"]}
+    for chosen in (("--model", model), ("--model", "tube", "--set", "initial=free")):
+        done = run_lagid("identify", data, *chosen, *words[:2], *QUICK, "--json")
+        assert "y(0)" in {one["name"] for one in json.loads(done.stdout)["parameters"]}
 
 
 def test_the_channels_that_a_refusal_names_can_be_typed(data: Path) -> None:

@@ -289,7 +289,8 @@ def test_one_parameter_of_the_runs_of_all_jobs_is_a_table_a_figure_and_a_file(
 ) -> None:
     page = client.get("/results?parameter=L").text
     assert page.count('<input type="checkbox" name="run"') == 13
-    assert "<b>0.11270</b> ± 0.00023\u202fs" in page
+    assert "<b>0.11270</b>\u202fs</td>" in page
+    assert '<td class="n wide">0.00023</td>' in page
     assert '<option value="/seed">seed</option>' in page
     assert (
         f'href="/v1/jobs/{filled_folder.sweep}/runs.csv"'

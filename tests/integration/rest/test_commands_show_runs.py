@@ -15,6 +15,7 @@ from service.cli.main import build_program
 from service.cli.printed_tables import print_trend
 from service.client.calls import ProblemError
 from service.client.client import Client
+from sysid.core.text import plain_interval, split_estimate
 from tests.support.service.local_runs import identify_job
 from tests.support.service.web_app import Through, parts_of, recording, store_csv
 
@@ -93,9 +94,11 @@ def test_one_run_is_shown_with_estimates_units_intervals_and_fit(batch: ServedRu
     assert batch.data not in told.output
     for one in run["parameters"]:
         (line,) = (row for row in told.output.splitlines() if row.startswith(f"{one['name']} "))
-        assert "±" in line
+        value, error = split_estimate(one["value"], one["stderr"])
+        assert line.split()[1] == value
+        assert f" {error} " in line
         assert f" {one['unit']} " in line
-        assert f"{one['interval95'][0]:.6g} to {one['interval95'][1]:.6g}" in line
+        assert f" {plain_interval(one['interval95'], one['stderr'])} " in line
         assert one["status"] in line
     assert f"RMS {run['rms']:.6g} m, fit {run['fit_percent']['estimation']:.2f} %" in told.output
     for warning in run["warnings"]:

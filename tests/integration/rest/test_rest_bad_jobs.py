@@ -85,7 +85,7 @@ def test_an_input_that_is_constant_is_told_with_what_it_leaves_open(
     run = identify_on(parts, constant(u=1.0), model="fopdt")
     assert run["state"] == "succeeded"
     (text,) = (one for one in run["warnings"] if "excites nothing" in one)
-    left = text.partition("unidentified: ")[2].split(", ")
+    left = text.partition("unidentified: ")[2].partition(". ")[0].split(", ")
     status = {one["name"]: one["status"] for one in run["parameters"]}
     assert left
     assert all(status[name] in ("group", "unidentifiable") for name in left)

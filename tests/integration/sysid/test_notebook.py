@@ -143,7 +143,18 @@ def test_a_result_is_a_few_lines(frame_result: Identification) -> None:
         f"Identification of 'fopdt', fit {frame_result.fit_percent.estimation:.2f} %, RMS 0.1"
     )
     assert "°C, validation fit" in head
-    assert rows[0].split()[:3] == ["K", *summarise_estimate(frame_result, "K")]
+    assert rows[0].split() == [
+        "parameter",
+        "estimate",
+        "95",
+        "%",
+        "interval",
+        "standard",
+        "error",
+        "unit",
+        "status",
+    ]
+    assert rows[1].split()[:3] == ["K", *summarise_estimate(frame_result, "K")]
     assert all(f"  {estimate.name}" in text for estimate in frame_result.parameters)
     assert "residuals on validation data: " in text
     assert len(text) < 1500

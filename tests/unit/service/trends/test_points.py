@@ -6,8 +6,14 @@ from typing import Any
 import pytest
 
 from service.repositories.trend_rows import TrendRow
-from service.trends.points import build_quantities, group_by_label, read_onset_estimates
+from service.trends.points import (
+    build_quantities,
+    group_by_label,
+    read_onset_estimates,
+    to_label_out,
+)
 from sysid.residuals.onset_delay import OnsetDelay
+from sysid.results.findings import Finding, note
 from sysid.results.result import Agreements
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
 
@@ -102,3 +108,15 @@ def test_onset_delays_of_several_experiments_are_averaged_with_their_errors() ->
     errors = [sqrt(pi / 2) * 0.02, sqrt(pi / 2) * 0.02]
     assert found["onset delay"] == pytest.approx((0.5, sqrt(sum(e**2 for e in errors)) / 2), 1e-4)
     assert read_onset_estimates([onset(0.4, 0.08, 16), onset(0.6, 0.06, 1)]) == {}
+
+
+def test_findings_that_are_no_notes_are_the_flags_of_a_label() -> None:
+    bound = Finding("bound", "identifiability", "caution", "L lies at its bound", "L lies at 0 s.")
+    remark = note("ridge", "identifiability", "T and L are not separable")
+    rows = [
+        make_row(run, 2.0, findings=(bound, remark), warnings=(bound.text, remark.text))
+        for run in "ab"
+    ]
+    told = to_label_out(2.0, rows, {}, {}, {})
+    assert told.flags == ["L lies at its bound"]
+    assert told.warnings == ["L lies at 0 s.", "T and L are not separable"]

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from service.trends.trend_text import list_notes
+from service.trends.trend_text import list_flags, list_notes
 
 EMPTY: dict[str, Any] = {"x": "length_m", "quantities": [], "labels": [], "notes": []}
 
@@ -30,3 +30,23 @@ def test_runs_that_are_not_in_the_table_are_counted_by_reason(
     counts: dict[str, int], said: list[str]
 ) -> None:
     assert list_notes({**EMPTY, **counts}) == said
+
+
+def test_flags_are_what_speaks_against_runs_and_what_stands_out() -> None:
+    drift = {"kind": "run", "drifted": True, "z": 4.2, "limit": 2.6}
+    point = {
+        "x": 5.0,
+        "status": "at bound",
+        "is_outlier": True,
+        "p_value": 0.001,
+        "drifts": [drift],
+    }
+    quantity = {"name": "L", "points": [point, {**point, "x": 9.0}]}
+    place = {"x": 5.0, "flags": ["L lies at its bound"], "warnings": ["T and L are not separable"]}
+    assert list_flags(place, [quantity]) == [
+        "L lies at its bound",
+        "L outlier (p = 0.001)",
+        "L drifted from the reference (z = +4.2, limit 2.6)",
+    ]
+    calm = {**place, "x": 7.0, "flags": []}
+    assert list_flags(calm, [quantity]) == []

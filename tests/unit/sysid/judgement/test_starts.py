@@ -46,7 +46,7 @@ def compare(problem: Problem) -> StartComparison:
 def test_a_plant_at_rest_needs_no_start() -> None:
     comparison = compare(make_problem(0.0))
     assert [one.name for one in comparison.fits] == ["free", "rest"]
-    best = comparison.preferred
+    best = comparison.best
     assert best.name == "rest"
     assert best.stderrs["K"] < 0.5 * comparison.own.stderrs["K"]
     assert best.values["K"] == pytest.approx(2.0, abs=3 * best.stderrs["K"])
@@ -55,7 +55,7 @@ def test_a_plant_at_rest_needs_no_start() -> None:
 
 def test_nothing_speaks_for_a_start_that_explains_no_more() -> None:
     comparison = compare(make_problem(0.0))
-    rested = comparison.take(comparison.preferred)
+    rested = comparison.take(comparison.best)
     assert not comparison.own.is_open
     estimates = analyse_estimate(rested.own.problem, rested.own.theta).estimates
     assert list(find_open_starts(rested, estimates)) == []
@@ -63,7 +63,7 @@ def test_nothing_speaks_for_a_start_that_explains_no_more() -> None:
 
 def test_an_open_start_that_moves_an_estimate_is_found() -> None:
     comparison = compare(make_problem(0.0))
-    rested = comparison.take(comparison.preferred)
+    rested = comparison.take(comparison.best)
     free = replace(rested.fits[1], is_open=True)
     estimates = analyse_estimate(rested.own.problem, rested.own.theta).estimates
     [found] = find_open_starts(replace(rested, fits=(rested.own, free)), estimates)
@@ -76,7 +76,7 @@ def test_an_open_start_that_moves_an_estimate_is_found() -> None:
 
 def test_a_record_amid_a_motion_rules_a_rest_out() -> None:
     comparison = compare(make_problem(1.0))
-    assert comparison.preferred.name == "free"
+    assert comparison.best.name == "free"
     assert [one.is_open for one in comparison.fits] == [True, False]
 
 
@@ -85,7 +85,7 @@ def test_a_start_is_compared_from_either_side() -> None:
     rest = free.rebuild(initial="rest")
     names = [one.name for one in compare(rest).fits]
     assert names == ["rest", "free"]
-    assert compare(rest).preferred.bic == pytest.approx(compare(free).preferred.bic, rel=1e-6)
+    assert compare(rest).best.bic == pytest.approx(compare(free).best.bic, rel=1e-6)
 
 
 @pytest.mark.parametrize("initial", ["rest", "free"])
@@ -139,4 +139,4 @@ def test_a_lag_at_its_upper_bound_explains_nothing() -> None:
     assert free.values["L"] == lag
     assert free.bic < rest.bic
     assert [free.is_open, rest.is_open] == [False, True]
-    assert comparison.preferred is rest
+    assert comparison.best is rest

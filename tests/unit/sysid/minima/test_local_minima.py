@@ -9,6 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from sysid.core.settings import GeneticAlgorithm, Stop
+from sysid.core.types import FloatArray
 from sysid.data.noise import Noise, draw_noise
 from sysid.identification import best_estimate
 from sysid.identification.conclude import conclude_run
@@ -19,7 +20,7 @@ from sysid.minima.local_minima import (
     LocalMinima,
     count_affordable_simulations,
     find_local_minima,
-    widen_intervals,
+    list_compatible_minima,
 )
 from sysid.minima.minima import scan_parameters
 from sysid.models.catalogue.load import load_model
@@ -29,6 +30,7 @@ from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.intervals import compose_intervals, mark_poor_intervals
 from sysid.uncertainty.linear_model import factor_covariance, linearise_outputs, make_move_generator
 from tests.support.library.search_problems import COULOMB, clean, example, noisy, record
 
@@ -241,6 +243,12 @@ A = Parameter("a", 0.0, 5.0, "1")
 ONE = Estimate("a", "1", 2.0, 0.0, 5.0, 0.1, (1.8, 2.2), "identified", "")
 
 
+def widen(estimate: Estimate, n: int, found: LocalMinima, ratio: FloatArray = SAME) -> Estimate:
+    """Widen an interval by these minima."""
+    near = list_compatible_minima(("a",), n, found, ratio, np.array([2.0]))
+    return compose_intervals((estimate,), near)[0]
+
+
 @pytest.mark.parametrize(("ratio", "low"), [(0.0, 1.4), (2.0, 1.6 - 0.1 * np.sqrt(2)), (4.1, 1.8)])
 def test_an_interval_holds_the_values_of_minima_that_the_data_do_not_rule_out(
     ratio: float, low: float
@@ -248,14 +256,14 @@ def test_an_interval_holds_the_values_of_minima_that_the_data_do_not_rule_out(
     n = 50
     rms = np.array([1.0, np.exp(ratio / (2 * n))])
     found = LocalMinima(None, np.array([[2.0], [1.6]]), rms, 0)
-    wide = widen_intervals((ONE,), (A,), n, found, SAME)[0]
+    wide = widen(ONE, n, found)
     assert wide == replace(ONE, interval95=wide.interval95)
     assert wide.interval95 == pytest.approx((low, 2.2))
 
 
 def test_an_interval_that_other_minima_widen_to_much_of_the_range_says_little() -> None:
     found = LocalMinima(None, np.array([[2.0], [0.0]]), np.array([1.0, 1.0]), 0)
-    wide = widen_intervals((ONE,), (A,), 50, found, SAME)[0]
+    (wide,) = mark_poor_intervals((A,), (widen(ONE, 50, found),))
     assert wide.status == "unidentifiable"
     assert wide.reason.endswith("its 95 % interval contains 0, and 44 % of its range")
 
@@ -263,23 +271,23 @@ def test_an_interval_that_other_minima_widen_to_much_of_the_range_says_little() 
 def test_of_coloured_residuals_a_minimum_is_as_likely_as_their_variance_says() -> None:
     n, share = 50, np.array([0.25])  # standard errors twice those of white residuals
     found = LocalMinima(None, np.array([[2.0], [1.6]]), np.array([1.0, np.exp(8.0 / (2 * n))]), 0)
-    white = widen_intervals((ONE,), (A,), n, found, SAME)[0]
+    white = widen(ONE, n, found)
     assert white.interval95 == pytest.approx((1.8, 2.2))
-    wide = widen_intervals((ONE,), (A,), n, found, share)[0]
+    wide = widen(ONE, n, found, share)
     assert wide.interval95 == pytest.approx((1.6 - 0.1 * np.sqrt(2.0), 2.2))
 
 
 def test_the_interval_of_a_parameter_on_a_plateau_stays_around_its_middle() -> None:
     found = LocalMinima(None, np.array([[2.0], [1.6]]), np.array([1.0, 1.0]), 0)
-    assert widen_intervals((ONE,), (A,), 50, found, np.array([np.nan])) == (ONE,)
+    assert widen(ONE, 50, found, np.array([np.nan])) == ONE
 
 
 def test_an_estimate_without_a_standard_error_gets_none_by_its_neighbours() -> None:
     blind = replace(ONE, stderr=None, interval95=None)
     found = LocalMinima(None, np.array([[2.0]]), np.array([1.0]), 0)
-    assert widen_intervals((blind,), (A,), 50, found, SAME) == (blind,)
+    assert widen(blind, 50, found) == blind
 
 
 def test_beside_a_perfect_fit_nothing_else_is_likely() -> None:
     found = LocalMinima(None, np.array([[2.0], [1.6]]), np.array([0.0, 1e-9]), 0)
-    assert widen_intervals((ONE,), (A,), 50, found, SAME)[0].interval95 == pytest.approx((1.8, 2.2))
+    assert widen(ONE, 50, found).interval95 == pytest.approx((1.8, 2.2))

@@ -14,7 +14,7 @@ from sysid.residuals.series import make_whitening
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
-from sysid.uncertainty.intervals import LocalStatistics, make_estimates
+from sysid.uncertainty.local_estimates import LocalStatistics, make_estimates
 from sysid.uncertainty.profile_likelihood import compute_profile
 from tests.support.library.search_problems import example
 from tests.support.library.small_models import LINE

@@ -1,0 +1,69 @@
+"""Printed results: the verdict first, each finding once, and one dead time for one model."""
+
+from dataclasses import replace
+from typing import Any
+
+from sysid.residuals.residual_tests import ResidualTest, ResidualTests
+from sysid.results.findings import Finding, list_untold_reasons, note
+from sysid.results.identification import Identification
+from sysid.results.parts import OrderFit, compare_fits
+from sysid.results.summary import describe_order, list_evidence, summarise_result
+from sysid.results.verdict import Verdict
+from tests.support.storage.run_results import conclude
+
+CAUTION = Finding("order", "structure", "caution", "the data prefer sopdt", "L is 1.3 s.", "", 30.0)
+COLOURED = ResidualTests(
+    "estimation", False, (ResidualTest(0, "y", "whiteness", None, "failed", 90, p=1e-5),)
+)
+
+
+def find(**fields: Any) -> Identification:
+    return replace(conclude(K=(2.0, 0.05), L=(1.57, 0.07)).identification, **fields)
+
+
+def compare(sopdt_bic: float) -> Any:
+    first = OrderFit("fopdt", 1, 1.55, 0.01, {"L": 1.55}, 0.027, -1264.0)
+    second = OrderFit("sopdt", 2, 1.33, 0.01, {"L": 1.33}, 0.019, sopdt_bic)
+    return compare_fits("fopdt", "L", "s", "white", (first, second))
+
+
+def test_the_order_is_told_without_a_second_value_of_the_model() -> None:
+    assert describe_order(compare(-1200.0)) == "order: the data prefer fopdt to sopdt"
+    assert describe_order(compare(-1262.0)) == (
+        "order: the data do not tell fopdt and sopdt apart; L is 1.330 ± 0.010 s with sopdt"
+    )
+
+
+def test_the_order_reassures_nobody_beside_another_doubt() -> None:
+    order = compare(-1200.0)
+    alone = find(order_comparison=order, findings=(note("ridge", "identifiability", "alike"),))
+    assert describe_order(order) in list_evidence(alone)
+    doubted = find(order_comparison=order, findings=(replace(CAUTION, explanation="drift"),))
+    told = find(order_comparison=order, findings=(replace(CAUTION, severity="note"),))
+    assert list_evidence(doubted) == list_evidence(told) == []
+
+
+def test_failed_tests_beside_a_trustworthy_result_are_explained() -> None:
+    failed = "residuals on estimation data: failed: y is not white (p < 0.001)"
+    calm = find(residual_tests=COLOURED)
+    assert list_evidence(calm) == [f"{failed}; no explanation of that moves an estimate"]
+    assert list_evidence(replace(calm, explained=False)) == [f"{failed}, weakly"]
+    doubted = replace(calm, verdict=Verdict("limited", "trustworthy, but L drifts"))
+    assert list_evidence(doubted) == [failed]
+
+
+def test_reasons_of_statuses_are_told_once_and_outside_the_table() -> None:
+    parameters = tuple(replace(one, reason="it is at the end") for one in find().parameters)
+    found = find(parameters=parameters, findings=(CAUTION,), warnings=(CAUTION.sentences,))
+    lines = summarise_result(found).splitlines()
+    assert lines[1] == "verdict: trustworthy"
+    assert lines[-2:] == ["note: L is 1.3 s.", "note: K and L: it is at the end"]
+    told = replace(CAUTION, parameters=("L",))
+    assert list_untold_reasons(parameters, [told]) == ["K: it is at the end"]
+
+
+def test_a_search_that_did_not_settle_is_told_by_its_finding() -> None:
+    found = find()
+    assert "the search settled: 5 of 10 independent starts ended here" in repr(found)
+    restless = replace(found, search=replace(found.search, settled=False, because=None))
+    assert "independent starts" not in repr(restless)
