@@ -111,5 +111,5 @@ def test_one_constant_output_of_two_is_a_caution() -> None:
     record = make_record(np.arange(float(N)), np.arange(float(N)))
     (y,) = record.outputs
     both = Record(record.inputs, (y, Channel("z", y.times, np.full(N, 2.0))))
-    (found,) = find_constant_outputs(Problem.build(model, [both]))
+    (found,) = find_constant_outputs(Problem.build(model, [both], weights={"y": 1.0, "z": 1.0}))
     assert (found.severity, found.brief) == ("caution", "z is constant")
