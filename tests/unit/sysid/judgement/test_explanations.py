@@ -79,7 +79,6 @@ LAG_CHANGES = CONSTANCY[2]
 OTHER = replace(FAST, gain=-3.0, times=(6.0,))
 CHANGED = (("K", "K"), ("T", "T1"), ("L", "L"), ("K", "K"), ("L", "L"))
 """What changes in each case of constancy, in both plants."""
-STILL_IDENTIFIED = {(0, "sopdt")}
 
 
 @pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.model)
@@ -136,18 +135,8 @@ def test_a_text_has_one_value_before_a_change() -> None:
 @pytest.mark.parametrize(
     ("case", "plant", "name"),
     [
-        pytest.param(
-            case,
-            plant,
-            name,
-            id=f"{case.name}, {plant.model}",
-            marks=pytest.mark.xfail(
-                strict=True, reason="of a change of unit only the value before counts"
-            )
-            if (number, plant.model) in STILL_IDENTIFIED
-            else (),
-        )
-        for number, (case, names) in enumerate(zip(CONSTANCY, CHANGED, strict=True))
+        pytest.param(case, plant, name, id=f"{case.name}, {plant.model}")
+        for case, names in zip(CONSTANCY, CHANGED, strict=True)
         for plant, name in zip(PLANTS, names, strict=True)
     ],
 )
@@ -172,7 +161,6 @@ def test_a_missing_time_constant_is_no_fault_of_exact_records(plant: Process, se
     assert first.family == "structure"
 
 
-@pytest.mark.xfail(strict=True, reason="a gain of 2000 is a note, since it also widens all errors")
 @pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.model)
 def test_a_unit_that_jumps_far_leaves_no_trust(plant: Process) -> None:
     """Its residuals are so large that errors hide every move: only the gain tells."""
