@@ -16,7 +16,11 @@ from sysid.identification.best_estimate import IslandEnd, find_best_estimate, is
 from sysid.identification.budget import Budget
 from sysid.identification.deadline import Clock, Deadline
 from sysid.islands.run_state import RunState
-from sysid.judgement.agreement import find_constant_outputs, find_disagreement
+from sysid.judgement.agreement import (
+    find_better_yardstick,
+    find_constant_outputs,
+    find_disagreement,
+)
 from sysid.judgement.conclusions import (
     conclude_estimates,
     conclude_verdict,
@@ -25,6 +29,7 @@ from sysid.judgement.conclusions import (
 )
 from sysid.judgement.determination import find_ambiguous, find_undetermined
 from sysid.judgement.hard_switching import find_hard_switches
+from sysid.judgement.holding_bounds import find_cause_in_bounds
 from sysid.judgement.input_hold import (
     find_hold_doubts,
     find_other_readings,
@@ -35,6 +40,7 @@ from sysid.judgement.integration_step import find_finer_step
 from sysid.judgement.judge import select_explanations
 from sysid.judgement.levels import SOLVER_SHARE
 from sysid.judgement.noise_findings import find_feedback, find_noise_model, find_unexplained
+from sysid.judgement.open_terms import find_open_terms
 from sysid.judgement.preparation import (
     find_early_responses,
     find_few_repeats,
@@ -51,6 +57,7 @@ from sysid.judgement.unstable_run import (
     find_misled_run,
 )
 from sysid.judgement.validation import find_contradictions, split_outputs, validate_estimates
+from sysid.judgement.yardstick import fit_yardstick
 from sysid.minima.minima import mark_ambiguous
 from sysid.minima.search_evidence import assess_search, is_explained
 from sysid.noise_models.generalised_least_squares import resolve_noise_model
@@ -177,12 +184,22 @@ def _build_identification(
         metrics.rms,
         run_residual_tests(problem, simulated, "estimation") if any(times.values()) else tests,
     )
+    is_white = analysis.uncertainty is None or analysis.uncertainty.noise_colour == "white"
+    measures = compares_orders and not is_white  # beside white residuals nothing is better
+    yardstick = fit_yardstick(problem, simulated) if measures else None
     is_of_the_solver = metrics.rms <= SOLVER_SHARE * problem.output_scale
     findings = order_findings(
         [
             *find_disagreement(metrics, limit, are_residuals_noise=are_noise),
             *find_constant_outputs(problem),
-            *find_unsettled(evidence, estimates),
+            *find_better_yardstick(
+                yardstick,
+                [one.name for one in estimates if one.is_free],
+                is_explained=any(one.gain for one in explained.findings),
+            ),
+            *find_unsettled(
+                evidence, estimates, lambda: find_cause_in_bounds(problem, theta, analysis)
+            ),
             *find_contradictions(problem, metrics, validated, estimates),
             *find_misled_run(estimates, ahead),
             *select_explanations(
@@ -194,6 +211,7 @@ def _build_identification(
                 ],
             ),
             *find_ambiguous(estimates),
+            *find_open_terms(estimates, problem.model),
             *find_undetermined(problem, analysis, delays, are_residuals_noise=are_noise),
             *find_early_responses(problem),
             *find_unrecorded_input(problem, analysis, is_contradicted=minima.is_contradicted),
