@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from sysid.core.settings import GeneticAlgorithm
+from sysid.identifiability.active_bounds import ActiveBound
 from sysid.judgement.settling import find_rough_end, find_unsettled
 from sysid.results.findings import Finding
 from sysid.results.parts import SearchEvidence
@@ -49,10 +50,15 @@ def test_a_search_without_independent_starts_says_so() -> None:
     assert "it made no independent starts" in found.text
 
 
-def test_bounds_that_may_be_the_cause_are_named() -> None:
-    bounded = replace(LAG, status="at bound")
-    (found,) = find_unsettled(SearchEvidence(False, None, 6, 1), [GAIN, bounded])
-    assert "L at a bound may be the cause." in found.text
+def test_bounds_that_are_the_cause_are_named_and_looked_for_only_then() -> None:
+    bound = ActiveBound("L", "upper", 5.0, "s", 0.5)
+    (found,) = find_unsettled(SearchEvidence(False, None, 6, 1), [GAIN, LAG], lambda: [bound])
+    assert "Bounds are the cause: L is at its upper bound 5 s." in found.text
+
+    def refuse() -> tuple[ActiveBound, ...]:
+        raise AssertionError
+
+    assert list(find_unsettled(SearchEvidence(True, "starts", 8, 8), [LAG], refuse)) == []
 
 
 def test_an_optimum_is_no_finding() -> None:
