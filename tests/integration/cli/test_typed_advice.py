@@ -93,7 +93,7 @@ def identify(data: Path, *words: object, model: object = "fopdt") -> str:
 
 
 def test_settings_are_found_where_they_are_written() -> None:
-    some = {"hold: {u: zero}", "loss: {noise_model: ar1}", "prediction: one-step"}
+    some = {"hold: {u: zero}", "loss: {noise_model: white}", "prediction: one-step"}
     assert some <= {*list_settings()}
     assert {"validation.fraction=0.3", "parameters.L.upper=0.5"} <= {*list_changes()}
 
