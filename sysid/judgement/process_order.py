@@ -10,9 +10,8 @@ entry of the catalogue, at rest if the model is, else with free initial states, 
 step. Least squares starts from the estimate. A dead time that grows by the time constant that is
 left out keeps the sum of all.
 
-The criterion is Schwarz's (BIC, 1978). If the residuals of the highest order are not white, or the
-estimate has a noise model, each order has first-order noise of its own, with the correlation time
-of its largest likelihood. An order is preferred if its BIC is 6 lower than that of every other:
+The criterion is Schwarz's (BIC, 1978), as for all explanations (`sysid.judgement.residual_model`):
+each order has noise of its own, an autoregression that is estimated with it. An order is preferred if its BIC is 6 lower than that of every other:
 odds of 20 to 1 (Kass and Raftery 1995: strong evidence). Orders within 6 of the lowest are open,
 and the dead time lies in the range of theirs.
 """
@@ -43,7 +42,7 @@ from sysid.results.parts import OrderComparison, OrderFit, compare_fits
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.start_values import starts_at_rest
-from sysid.uncertainty.analysis import analyse_estimate, compute_criteria
+from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.estimates import Estimate
 
 _SUBSTEPS = 4  # of every order: a fast part needs them, and one step for all compares them fairly
@@ -110,14 +109,10 @@ def compare_orders(
     entries = list_neighbouring_orders(assumptions.process)
     if max_simulations is not None and max_simulations < _MAX_SIMULATIONS * len(entries):
         return None, 0
-    fits, spent = list[_FittedOrder](), 0
-    for entry in entries:
-        fitted = _fit_order(problem, entry, assumptions, is_late)
-        if fitted is None:
-            return None, spent
-        spent += fitted.evaluations
-        fits.append(fitted)
-    if len(fits) < 2:
+    tried = [_fit_order(problem, entry, assumptions, is_late) for entry in entries]
+    fits = [fitted for fitted in tried if fitted is not None]
+    spent = sum(fitted.evaluations for fitted in fits)
+    if len(fits) < max(2, len(tried)):
         return None, spent
     has_colour = problem.loss.noise_model == "ar1" or _has_coloured_residuals(fits[-1])
     compared, contexts, bounded = list[OrderFit](), dict[str, ResidualContext](), set[str]()
@@ -165,12 +160,10 @@ def _judge_fit(
 def find_other_orders(
     comparison: OrderComparison | None, model: str, estimates: Sequence[Estimate]
 ) -> Iterator[Finding]:
-    """Find orders that the data prefer, or find as likely, and that move the dead time.
+    """Find orders that the data prefer, or do not rule out, and that move the dead time.
 
-    An order that was chosen by one who knows the plant has the odds that would exclude another
-    (`STRONG_ODDS`). So others count if they are as likely by the data. They move the dead time by
-    more than its interval. Another order is advised if nothing but noise is left by it. `model` is
-    the name of the model that was identified.
+    Those that count move it by more than its interval. Another order is advised if nothing but
+    noise is left by it. `model` is the name of the model that was identified.
     """
     if comparison is None or comparison.preferred_model == comparison.model:
         return
@@ -178,7 +171,7 @@ def find_other_orders(
     estimate = next(one for one in estimates if one.name == name)
     others = [fit for fit in comparison.open_fits if fit.model != own.model]
     best = min(others, key=lambda fit: fit.bic)
-    moved = [fit for fit in others if _is_moved(fit, own) and fit.bic < own.bic]
+    moved = [fit for fit in others if _is_moved(fit, own)]
     if comparison.preferred_model is None and not moved:
         return
     listed = ", ".join(_write_delay(comparison, fit) for fit in (own, *others))
@@ -194,7 +187,8 @@ def find_other_orders(
             f"{own.order}): its BIC is {own.bic - best.bic:.3g} lower. {name} is {listed}."
         )
         cure = "Give your model as many time constants, or use" if model != own.model else "Use"
-        advice = f"{cure} the model {best.model}." if best.leaves_noise else ""
+        is_cure = best.leaves_noise and best.order > own.order
+        advice = f"{cure} the model {best.model}." if is_cure else ""
     yield Finding(
         "order",
         "structure",
@@ -365,9 +359,8 @@ def _assess_order(
         spent += simulations
     residuals = problem.compute_residuals(theta[None])[0]
     analysis = analyse_estimate(problem, theta, whitening=whitening)
-    criteria = compute_criteria(
-        problem, residuals if whitening is None else whitening.whiten(residuals), whitening
-    )
+    context = ResidualContext(problem, theta, analysis)
+    used = theta.size * float(np.log(max(problem.n_scored, 2)))
     delay = next(estimate for estimate in analysis.estimates if estimate.name == "L")
     order = OrderFit(
         fitted.entry.model,
@@ -376,7 +369,6 @@ def _assess_order(
         delay.stderr,
         {estimate.name: estimate.value for estimate in analysis.estimates},
         float(np.sqrt(np.mean(np.square(residuals)))),
-        criteria.bic,
+        context.residual_model.without.criterion + used,
     )
-    context = ResidualContext(problem, theta, analysis)
     return order, context, delay.status == "at bound", spent + analysis.evaluations + 1
