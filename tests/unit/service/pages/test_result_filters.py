@@ -130,5 +130,7 @@ def test_orders_reassure_nobody_beside_another_doubt() -> None:
     parts: Any = template_environment().get_template("parts.html").module
     for findings, is_shown in (((), True), ((ORDER,), True), ((CHANGE,), False)):
         text = str(parts.evidence(find(*findings, order_comparison=orders)))
-        assert ("sopdt" in text) is is_shown
+        assert ('<table class="orders ' in text) is is_shown
+        assert ("strong evidence against" in text) is is_shown
+        assert ('data-label="BIC − lowest BIC">64.0</td>' in text) is is_shown
         assert "1.55" not in text  # the estimates have it
