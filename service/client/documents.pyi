@@ -1749,6 +1749,12 @@ class SelectedTermDocument(TypedDict):
     """share explained with all terms so far"""
     coefficient: float | None
     """coefficient in the model of all selected terms, before the search. It comes from one-step least squares, or from the free run if that selected the terms. Its unit follows from the term"""
+    probability: float | None
+    """probability that the term belongs to the model: the weight of the selections with it"""
+    coverage: float | None
+    """probability that the 95 % interval of the coefficient holds, over all these selections"""
+    rival: str
+    """the likeliest other selection: the change in words. Empty if term and coefficient are certain"""
 
 class SequenceInDocument(TypedDict):
     """The sequence search."""

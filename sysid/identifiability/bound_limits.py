@@ -7,6 +7,9 @@ keep the sign that the bounds imply; a time constant, for example, stays positiv
 from collections.abc import Callable, Iterator, Mapping
 from math import inf
 
+import numpy as np
+
+from sysid.core.types import FloatArray
 from sysid.language.functions import Interval
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, walk
 from sysid.language.value_intervals import bound_expression
@@ -15,10 +18,27 @@ from sysid.models.parameters import Parameter
 from sysid.models.sections import get_interval
 from sysid.models.ties import collect_parameter_names
 from sysid.simulation.problem import Problem
+from sysid.simulation.scaling import is_at_bounds
 
 _UNLIMITED_WIDTHS = 1e6  # times the range: a bound that may move so far has no limit
 _BISECTIONS = 80
 _ZERO_TOLERANCE = 1e-9  # of the range: a limit nearer to 0 is 0
+
+
+def list_widest_bounds(problem: Problem, point: FloatArray) -> tuple[Interval, ...]:
+    """List the widest bounds of parameters at a bound, and the bounds of the others.
+
+    Parameters
+    ----------
+    problem : Problem
+    point : FloatArray, shape (D,)
+        In [0, 1].
+    """
+    at_end = np.logical_or(*is_at_bounds(point))
+    return tuple(
+        find_widest_bounds(problem, parameter) if is_at_end else (parameter.lower, parameter.upper)
+        for parameter, is_at_end in zip(problem.free_parameters, at_end, strict=True)
+    )
 
 
 def find_widest_bounds(problem: Problem, parameter: Parameter) -> Interval:

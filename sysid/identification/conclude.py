@@ -25,6 +25,7 @@ from sysid.judgement.conclusions import (
 )
 from sysid.judgement.determination import find_ambiguous, find_undetermined
 from sysid.judgement.hard_switching import find_hard_switches
+from sysid.judgement.holding_bounds import find_cause_in_bounds
 from sysid.judgement.input_hold import (
     find_hold_doubts,
     find_other_readings,
@@ -35,6 +36,7 @@ from sysid.judgement.integration_step import find_finer_step
 from sysid.judgement.judge import select_explanations
 from sysid.judgement.levels import SOLVER_SHARE
 from sysid.judgement.noise_findings import find_feedback, find_noise_model, find_unexplained
+from sysid.judgement.open_terms import find_open_terms
 from sysid.judgement.preparation import (
     find_early_responses,
     find_few_repeats,
@@ -182,7 +184,9 @@ def _build_identification(
         [
             *find_disagreement(metrics, limit, are_residuals_noise=are_noise),
             *find_constant_outputs(problem),
-            *find_unsettled(evidence, estimates),
+            *find_unsettled(
+                evidence, estimates, lambda: find_cause_in_bounds(problem, theta, analysis)
+            ),
             *find_contradictions(problem, metrics, validated, estimates),
             *find_misled_run(estimates, ahead),
             *select_explanations(
@@ -194,6 +198,7 @@ def _build_identification(
                 ],
             ),
             *find_ambiguous(estimates),
+            *find_open_terms(estimates, problem.model),
             *find_undetermined(problem, analysis, delays, are_residuals_noise=are_noise),
             *find_early_responses(problem),
             *find_unrecorded_input(problem, analysis, is_contradicted=minima.is_contradicted),

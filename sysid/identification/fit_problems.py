@@ -85,7 +85,7 @@ def build_problems(model: Model, records: FitRecords, settings: FitSettings) -> 
         If model, records or settings cannot be used.
     """
     model, changes = select_model_terms(
-        model, records.estimation, settings.parameters, settings.skip
+        model, records.estimation, settings.parameters, settings.skip, settings.prediction
     )
     problem = Problem.from_settings(
         model, records.estimation, replace(settings, parameters=changes)

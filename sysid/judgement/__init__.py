@@ -1,1 +1,1 @@
-"""What speaks against an estimate: start, past, hold, step, order, suspects, validation."""
+"""What is said of an estimate: explanations of what the model leaves, on one scale."""

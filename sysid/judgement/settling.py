@@ -1,8 +1,9 @@
 """Settling: whether something shows that the search missed no better minimum."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from sysid.core.settings import GeneticAlgorithm
+from sysid.identifiability.active_bounds import ActiveBound
 from sysid.results.findings import Finding, note
 from sysid.results.parts import SearchEvidence
 from sysid.search.island import get_island_settings
@@ -11,8 +12,15 @@ from sysid.uncertainty.estimates import Estimate
 _NOTABLE_GAIN = 0.01  # of the squared error, by one step of least squares
 
 
-def find_unsettled(evidence: SearchEvidence, estimates: Sequence[Estimate]) -> Iterator[Finding]:
-    """Find a search that did not settle: nothing shows that its minimum is the best."""
+def find_unsettled(
+    evidence: SearchEvidence,
+    estimates: Sequence[Estimate],
+    holding: Callable[[], Sequence[ActiveBound]] = tuple,
+) -> Iterator[Finding]:
+    """Find a search that did not settle: nothing shows that its minimum is the best.
+
+    `holding` finds the bounds that are the cause, if some are.
+    """
     if evidence.settled:
         return
     agreed = (
@@ -21,8 +29,8 @@ def find_unsettled(evidence: SearchEvidence, estimates: Sequence[Estimate]) -> I
         else f"{evidence.agreeing_starts} of {evidence.independent_starts} independent starts "
         "ended in the best minimum"
     )
-    bounded = [one.name for one in estimates if one.status == "at bound"]
-    cause = f" {', '.join(bounded)} at a bound may be the cause." if bounded else ""
+    bounds = holding()
+    cause = f" Bounds are the cause: {', '.join(map(str, bounds))}." if bounds else ""
     yield Finding(
         "not settled",
         "search",

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 from sysid.language.printer import format_expression
@@ -10,9 +11,15 @@ from sysid.language.tree import Expression, PastValue
 from sysid.models.parameters import BoundsRule, Parameter
 
 Criterion = Literal["none", "bic"]
-ErrorKind = Literal["one-step", "simulation"]
+ErrorKind = Literal["auto", "one-step", "simulation"]
 MAX_SUBSTEPS = 1000
 """Most integration steps in one grid step."""
+
+
+@lru_cache(maxsize=2048)
+def _write_product(factors: tuple[PastValue, ...]) -> str:
+    powers = Counter(format_expression(factor).replace(" ", "") for factor in factors)
+    return "*".join(f"{name}**{n}" if n > 1 else name for name, n in powers.items()) or "1"
 
 
 class Term(NamedTuple):
@@ -23,10 +30,7 @@ class Term(NamedTuple):
     @property
     def label(self) -> str:
         """Text of the product, such as ``y(k-1)**2*u(k-1-dk)``."""
-        if not self.factors:
-            return "1"
-        powers = Counter(format_expression(factor).replace(" ", "") for factor in self.factors)
-        return "*".join(f"{name}**{n}" if n > 1 else name for name, n in powers.items())
+        return _write_product(self.factors)
 
     @property
     def coefficient_name(self) -> str:
@@ -48,15 +52,26 @@ class TermRule:
         ``bic``: choose the number of terms with the smallest Bayesian information criterion.
     exchange : bool
         Whether a selected term may be replaced by a better one afterwards.
-    error : {"one-step", "simulation"}
-        Error that the terms explain; ``simulation`` starts from the one-step selection.
+    error : {"auto", "one-step", "simulation"}
+        Error that the terms explain. ``simulation`` starts from the one-step selection; ``auto``
+        takes the one of the two that predicts better.
     """
 
     keep: int
     err: float | None = None
     criterion: Criterion = "none"
     exchange: bool = True
-    error: ErrorKind = "one-step"
+    error: ErrorKind = "auto"
+
+    @property
+    def is_fixed_number(self) -> bool:
+        """Whether `keep` is the number of terms, not a limit."""
+        return self.err is None and self.criterion == "none"
+
+    @property
+    def demand(self) -> "TermRule":
+        """The rule for the terms that the data demand, at most `keep`."""
+        return replace(self, criterion="bic") if self.is_fixed_number else self
 
 
 class SelectedTerm(NamedTuple):
@@ -75,12 +90,22 @@ class SelectedTerm(NamedTuple):
         Coefficient in the model of all selected terms, before the search. It comes from one-step
         least squares, or from the free run if that selected the terms. Its unit follows from the
         term.
+    probability : float
+        Probability that the term belongs to the model: the weight of the selections with it.
+    coverage : float
+        Probability that the 95 % interval of the coefficient holds, over all these selections.
+    rival : str
+        The likeliest other selection: the change in words. Empty if term and coefficient are
+        certain.
     """
 
     term: str
     err: float
     cumulated: float
     coefficient: float
+    probability: float
+    coverage: float
+    rival: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -97,7 +97,7 @@ def _read_rule(reader: DocumentReader, written: Mapping[str, Any], candidates: i
     most, keep = min(candidates, MAX_PARAMETERS), fields.get("keep")
     if keep is None and err is None and fields.get("criterion", "none") == "none":
         reader.add_fault("/terms/keep", "is missing; say how many terms to keep, such as 8")
-    error = reader.read_choice(fields.get("error", "one-step"), get_args(ErrorKind), "/terms/error")
+    error = reader.read_choice(fields.get("error", "auto"), get_args(ErrorKind), "/terms/error")
     # Without candidates another fault has been reported already.
     keeps_all = keep is None or most == 0
     number = max(most, 1) if keeps_all else _read_term_count(reader, keep, candidates, most)

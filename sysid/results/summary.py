@@ -8,6 +8,7 @@ from typing import Any
 from sysid.core.lazy_names import load_library
 from sysid.core.text import (
     DASH,
+    format_estimate,
     format_interval,
     plain_estimate,
     plain_interval,

@@ -10,6 +10,7 @@ term in turn is replaced by the term that explains most in its place, until no r
 """
 
 from collections.abc import Sequence
+from math import lgamma, log
 from typing import NamedTuple
 
 import numpy as np
@@ -175,26 +176,58 @@ def select_backward(triangle: FloatArray, order: Sequence[int]) -> dict[int, tup
     Removing term i increases the unexplained squares by aᵢ² / (G⁻¹)ᵢᵢ, with the inner products G of
     the terms.
     """
-    taken = list(order)
-    sets = {len(taken): tuple(taken)}
+    taken = tuple(order)
+    sets = {len(taken): taken}
     while len(taken) > 1:
-        basis, upper = np.linalg.qr(triangle[:, taken])
-        inverse = np.linalg.pinv(upper)
-        solution = inverse @ (basis.T @ triangle[:, -1])
-        spread = np.sum(np.square(inverse), axis=1)
-        taken.pop(int(np.argmin(np.square(solution) / np.where(spread > 0, spread, 1.0))))
-        sets[len(taken)] = tuple(taken)
+        taken = _remove_term(triangle, taken)
+        sets[len(taken)] = taken
     return sets
 
 
+def _remove_term(triangle: FloatArray, taken: tuple[int, ...]) -> tuple[int, ...]:
+    """Remove the least needed term."""
+    basis, upper = np.linalg.qr(triangle[:, list(taken)])
+    inverse = np.linalg.pinv(upper)
+    solution = inverse @ (basis.T @ triangle[:, -1])
+    spread = np.sum(np.square(inverse), axis=1)
+    least = int(np.argmin(np.square(solution) / np.where(spread > 0, spread, 1.0)))
+    return taken[:least] + taken[least + 1 :]
+
+
 def select_terms(triangle: FloatArray, rule: TermRule, samples: int) -> ForwardSelection:
-    """Select the terms by a rule, in the order in which they explain most."""
+    """Select the terms by a rule, in the order in which they explain most.
+
+    With `exchange`, sets of neighbouring sizes are compared after their exchanges: sequential
+    replacement (Miller, Subset Selection in Regression, 2nd ed. 2002, ch. 3). A rule for a number
+    of terms takes those that the criterion of Bayes demands first.
+    """
     if not rule.exchange:
         selection = select_forward(triangle, rule.keep, rule.err)
-        return selection.keep_first(_count_terms(selection.unexplained_shares, rule, samples))
-    taken = select_forward(
-        triangle, min(2 * rule.keep + 2, max(rule.keep, _MAX_BACKWARD_TERMS))
-    ).order
+        shares, candidates = selection.unexplained_shares, triangle.shape[1] - 1
+        return selection.keep_first(_count_terms(shares, rule, samples, candidates))
+    best = _select_by_exchange(triangle, rule.demand, samples)
+    if rule.is_fixed_number:
+        best = extend_terms(triangle, best, rule.keep)
+    return select_forward(triangle, len(best), among=best)
+
+
+def extend_terms(triangle: FloatArray, chosen: Sequence[int], keep: int) -> tuple[int, ...]:
+    """Extend a set to `keep` terms, each the one that explains most of the rest."""
+    remaining = _orthogonalise(triangle, chosen)
+    lost = np.sum(np.square(remaining), axis=0) <= _DEPENDENT_SHARE * np.sum(
+        np.square(triangle), axis=0
+    )
+    remaining = np.where(lost, 0.0, remaining)
+    others = [i for i in range(triangle.shape[1] - 1) if i not in chosen]
+    return (*chosen, *select_forward(remaining, keep - len(chosen), among=others).order)
+
+
+def _select_by_exchange(triangle: FloatArray, rule: TermRule, samples: int) -> tuple[int, ...]:
+    """Select by a rule that compares numbers of terms."""
+    forward = select_forward(triangle, min(2 * rule.keep + 2, max(rule.keep, _MAX_BACKWARD_TERMS)))
+    candidates = triangle.shape[1] - 1
+    wanted = _count_terms(forward.unexplained_shares, rule, samples, candidates)
+    taken = forward.order[: 2 * wanted + 2]
     backward_sets = select_backward(triangle, taken) if len(taken) <= _MAX_BACKWARD_TERMS else {}
     sets = [
         [taken[:k], backward_sets.get(k, taken[:k])]
@@ -202,38 +235,67 @@ def select_terms(triangle: FloatArray, rule: TermRule, samples: int) -> ForwardS
     ]
     whole = float(triangle[:, -1] @ triangle[:, -1])
     shares = [min(_compute_unexplained(triangle, terms) for terms in pair) / whole for pair in sets]
-    number = _count_terms(shares, rule, samples)
-    exchanged = [exchange_terms(triangle, terms) for terms in sets[number - 1]] if number else [()]
+    number = _count_terms(shares, rule, samples, candidates)
+    if number == 0:
+        return ()
+    exchanged = [exchange_terms(triangle, terms) for terms in sets[number - 1]]
     best = min(exchanged, key=lambda terms: _compute_unexplained(triangle, terms))
-    return select_forward(triangle, number, among=best)
+    return _leave_out_terms(triangle, best, rule, samples)
 
 
-def _count_terms(shares: Sequence[float], rule: TermRule, samples: int) -> int:
-    """Count the terms that a rule requires; `shares`: unexplained with 1, 2, … terms.
+def _leave_out_terms(
+    triangle: FloatArray, chosen: tuple[int, ...], rule: TermRule, samples: int
+) -> tuple[int, ...]:
+    """Leave out the least needed term and exchange the others, as long as the rule gains."""
+    whole, candidates = float(triangle[:, -1] @ triangle[:, -1]), triangle.shape[1] - 1
 
-    ``bic``: the number k of least n ln(S / n) + k ln n, with the unexplained squares S.
-    """
+    def rate(terms: tuple[int, ...]) -> tuple[float, ...]:
+        share = _compute_unexplained(triangle, terms) / whole
+        return rate_terms(rule, share, len(terms), samples, candidates)
+
+    while len(chosen) > 1:
+        fewer = exchange_terms(triangle, _remove_term(triangle, chosen))
+        if rate(fewer) >= rate(chosen):
+            break
+        chosen = fewer
+    return chosen
+
+
+def _count_terms(shares: Sequence[float], rule: TermRule, samples: int, candidates: int) -> int:
+    """Count the terms that a rule requires; `shares`: unexplained with 1, 2, … terms."""
     sufficient = [
         k for k, share in enumerate(shares, 1) if share < max(_EXPLAINED_SHARE, rule.err or 0.0)
     ]
     number = min(sufficient, default=len(shares))
     if rule.criterion == "none" or number == 0:
         return number
-    values = [_compute_bic(share, k, samples) for k, share in enumerate(shares[:number], 1)]
+    values = [
+        compute_bic(share, k, samples, candidates) for k, share in enumerate(shares[:number], 1)
+    ]
     return int(np.argmin(values)) + 1
 
 
-def _compute_bic(share: float, terms: int, samples: int) -> float:
-    return float(samples * np.log(max(share, _EXPLAINED_SHARE)) + terms * np.log(max(samples, 1)))
+def compute_bic(share: float | FloatArray, terms: int, samples: int, candidates: int) -> FloatArray:
+    """Compute the extended Bayesian information criterion of Chen and Chen (2008), γ = 1.
+
+    n ln S + k ln n + 2 ln (M over k), with the unexplained share S of k terms out of M candidates.
+    The last part pays for the search among many: all numbers of terms are as likely beforehand, and
+    so are all sets of one size (Scott and Berger 2010).
+    """
+    sets = lgamma(candidates + 1) - lgamma(terms + 1) - lgamma(candidates - terms + 1)
+    fit = samples * np.log(np.maximum(share, _EXPLAINED_SHARE))
+    return np.asarray(fit + terms * log(max(samples, 1)) + 2.0 * sets)
 
 
-def rate_terms(rule: TermRule, share: float, terms: int, samples: int) -> tuple[float, ...]:
+def rate_terms(
+    rule: TermRule, share: float, terms: int, samples: int, candidates: int
+) -> tuple[float, ...]:
     """Rate a set of terms by a rule, for comparison with another; smaller is better.
 
     With `criterion` the rating is that criterion. With `err` the fewest terms that leave less win.
     Otherwise, and for equal numbers of terms, the unexplained share decides.
     """
     if rule.criterion == "bic":
-        return (_compute_bic(share, terms, samples),)
+        return (float(compute_bic(share, terms, samples, candidates)),)
     is_enough = share < max(_EXPLAINED_SHARE, rule.err or 0.0)
     return (0.0, float(terms), share) if is_enough else (1.0, share)

@@ -24,13 +24,15 @@ from sysid.selection.lag_search import list_lag_values, plan_effort, search_lags
 from sysid.selection.regression import Regression, find_lag_parameters
 from sysid.simulation.problem import Problem
 
+DIVERGENCE_LIMIT = 1e6
+"""Of a free run that counts, in standard deviations of the output."""
+
 _RIDGES = (1e-8, 1e-6, 1e-4, 1e-2)  # of the sum of squares of a scaled column, which is 1
 _TERM_COUNTS = (1, 2, 3, 4, 6, 9, 13, 20, 32, 64)  # terms of the nested solutions
 _LAG_COMBINATIONS = 6  # combinations of the lags
 _MAX_ITERATIONS = 4  # of the simulated past values
 _ITERATED_STARTS = 2  # starts of these iterations
 _MAX_OPERATIONS = 1e9  # of one decomposition, about
-_DIVERGENCE_LIMIT = 1e6  # of the output's standard deviation
 _BUDGET_SHARE = 4  # all starts take at most one in so many simulations of a budget
 
 _CandidateStart: TypeAlias = tuple[Mapping[str, float], FloatArray]
@@ -103,6 +105,7 @@ class _StartFinder:
             for i, t in enumerate(self._terms)
             if t.coefficient_name in fixed
         }
+        self._names = [t.coefficient_name for t in self._terms]
         self._free = [i for i in range(len(self._terms)) if i not in self._fixed]
         rows = int(_MAX_OPERATIONS / (2 * (2 * len(self._terms) + 1) ** 2))
         self._rows = self._regression.thin_rows(max(rows, 20 * len(self._terms)))
@@ -223,7 +226,7 @@ class _StartFinder:
         self._count_evaluations(1)
         problem = self._problem
         predicted = problem.predict(self._to_individuals([start]))[0]
-        if not np.all(np.abs(predicted) < _DIVERGENCE_LIMIT * max(problem.output_scale, 1e-300)):
+        if not np.all(np.abs(predicted) < DIVERGENCE_LIMIT * max(problem.output_scale, 1e-300)):
             return None
         outputs, first = [], 0
         for piece, experiment in zip(
@@ -254,9 +257,7 @@ class _StartFinder:
     def _to_parameter_values(self, start: "_CandidateStart") -> dict[str, float]:
         """Convert a start to values of free parameters, inside their bounds."""
         lags, coefficients = start
-        named = {
-            t.coefficient_name: float(c) for t, c in zip(self._terms, coefficients, strict=True)
-        }
+        named = dict(zip(self._names, coefficients.tolist(), strict=True))
         named |= lags
         return {
             parameter.name: min(max(named[parameter.name], parameter.lower), parameter.upper)

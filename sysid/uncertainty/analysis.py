@@ -32,7 +32,7 @@ from sysid.core.distributions import student_limit
 from sysid.core.linear_algebra import TruncatedSvd, compute_truncated_svd
 from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 from sysid.identifiability.active_bounds import ActiveBound, is_active, rank_active_bounds
-from sysid.identifiability.bound_limits import find_widest_bounds
+from sysid.identifiability.bound_limits import list_widest_bounds
 from sysid.identifiability.combinations import (
     ParameterBlock,
     classify_directions,
@@ -266,11 +266,7 @@ def _analyse_sensitivities(
 def _find_active_bounds(
     problem: Problem, influence: FloatArray, columns: FloatArray, point: FloatArray
 ) -> tuple[ActiveBound, ...]:
-    at_end = np.logical_or(*is_at_bounds(point))
-    limits = tuple(
-        find_widest_bounds(problem, parameter) if is_at_end else (parameter.lower, parameter.upper)
-        for parameter, is_at_end in zip(problem.free_parameters, at_end, strict=True)
-    )
+    limits = list_widest_bounds(problem, point)
     return rank_active_bounds(problem.free_parameters, limits, influence, columns, point)
 
 

@@ -4,10 +4,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sysid.diagnosis.holding_bounds import find_cause_in_bounds
 
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.identifiability.active_bounds import ActiveBound, is_active, rank_active_bounds
+from sysid.identifiability.active_bounds import (
+    ActiveBound,
+    find_holding_bounds,
+    is_active,
+    rank_active_bounds,
+)
 from sysid.identifiability.bound_limits import find_widest_bounds
 from sysid.models.model import Model
 from sysid.models.parameters import Parameter
@@ -15,6 +21,7 @@ from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
 from sysid.uncertainty.analysis import analyse_estimate
+from tests.support.library.polynomials import TRUTH, document, record_of
 
 TIMES = 0.05 * np.arange(400.0)
 ANYWHERE = (-np.inf, np.inf)
@@ -186,3 +193,53 @@ def test_a_base_keeps_its_sign_where_its_power_needs_one(
     )
     problem = Problem.build(model, [Record((U,), (Channel("y", TIMES, np.sin(TIMES), "V"),))])
     assert find_widest_bounds(problem, problem.free_parameters[0]) == expected
+
+
+def find_holding(columns: FloatArray, truth: FloatArray, place: FloatArray) -> list[str]:
+    noise = np.random.default_rng(8).standard_normal(columns.shape[0])
+    influence = columns @ (place - truth) + noise
+    limits = (ANYWHERE,) * place.size
+    found = find_holding_bounds(space(place.size), limits, influence, columns, place)
+    return [f"{one.name} {one.side}" for one in found]
+
+
+def test_a_bound_that_costs_little_still_holds_a_search_if_the_data_show_it() -> None:
+    rng = np.random.default_rng(2)
+    columns = rng.standard_normal((20_000, 2))
+    place, truth = np.array([1.0, 0.5]), np.array([1.15, 0.5])  # 2 % of the squared error
+    assert find_holding(columns, truth, place) == ["a upper"]
+    assert find_holding(columns[:200], truth, place) == []  # here it may be chance
+    influence = columns @ (place - truth) + rng.standard_normal(20_000)
+    assert rank_active_bounds(space(2), (ANYWHERE,) * 2, influence, columns, place) == ()
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_bound_at_the_true_value_holds_nothing(seed: int) -> None:
+    columns = np.random.default_rng(seed).standard_normal((1000, 2))
+    assert find_holding(columns, np.array([1.0, 0.5]), np.array([1.0, 0.5])) == []
+
+
+def test_neighbouring_residuals_that_are_alike_tell_less() -> None:
+    rng = np.random.default_rng(3)
+    slow = np.convolve(rng.standard_normal(2099), np.ones(100) / 10, "valid")
+    columns = np.convolve(rng.standard_normal(2099), np.ones(100) / 10, "valid")[:, None]
+    influence = slow - 0.15 * columns[:, 0]
+    assert find_holding_bounds(space(1), (ANYWHERE,), influence, columns, np.array([1.0])) == ()
+    shuffled = rng.permutation(2000)
+    found = find_holding_bounds(
+        space(1), (ANYWHERE,), influence[shuffled], columns[shuffled], np.array([1.0])
+    )
+    assert [one.name for one in found] == ["a"]
+
+
+def test_the_bounds_of_a_polynomial_are_told_as_the_cause() -> None:
+    record = record_of(TRUTH, noise=0.01)
+    changes = {"a[y(k-1)]": {"upper": 0.5}}
+    held = Problem.build(parse_model(document(list(TRUTH))), [record], parameters=changes)
+    values = {f"a[{term}]": value for term, value in TRUTH.items()} | {"a[y(k-1)]": 0.5}
+    theta = np.array([values[one.name] for one in held.free_parameters])
+    [only] = find_cause_in_bounds(held, theta, analyse_estimate(held, theta))
+    assert (only.name, only.side, only.bound) == ("a[y(k-1)]", "upper", 0.5)
+    free = Problem.build(parse_model(document(list(TRUTH))), [record])
+    inside = theta.copy()
+    assert find_cause_in_bounds(free, inside, analyse_estimate(free, inside)) == ()

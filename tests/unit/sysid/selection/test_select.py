@@ -279,14 +279,14 @@ def test_the_criterion_of_bayes_holds_for_the_free_run_too(seed: int) -> None:
 def test_sets_of_terms_are_ranked_by_the_rule() -> None:
     bic = TermRule(9, criterion="bic")
     for factor, less in ((0.99, False), (0.90, True)):  # ln n / n is 0.046 at 100 samples
-        assert (rate_terms(bic, factor * 0.1, 6, 100) < rate_terms(bic, 0.1, 5, 100)) is less
+        assert (rate_terms(bic, factor * 0.1, 6, 100, 9) < rate_terms(bic, 0.1, 5, 100, 9)) is less
     kept = TermRule(9)
-    assert rate_terms(kept, 0.099, 9, 100) < rate_terms(kept, 0.1, 5, 100)
+    assert rate_terms(kept, 0.099, 9, 100, 9) < rate_terms(kept, 0.1, 5, 100, 9)
     enough = TermRule(9, err=0.05)
     assert (
-        rate_terms(enough, 0.049, 4, 100)
-        < rate_terms(enough, 0.01, 5, 100)
-        < rate_terms(enough, 0.06, 3, 100)
+        rate_terms(enough, 0.049, 4, 100, 9)
+        < rate_terms(enough, 0.01, 5, 100, 9)
+        < rate_terms(enough, 0.06, 3, 100, 9)
     )
 
 
@@ -335,13 +335,13 @@ def test_every_pair_of_terms_can_be_asked_for_as_candidates() -> None:
 
 
 def test_pages_show_the_selected_terms_in_their_order() -> None:
-    first = SelectedTerm("y(k-1)", 0.583, 0.583, 1.5)
-    second = SelectedTerm("u(k-1)", 0.417, 1.0 + 1e-16, 0.5)
+    first = SelectedTerm("y(k-1)", 0.583, 0.583, 1.5, 1.0, 0.0, "")
+    second = SelectedTerm("u(k-1)", 0.417, 1.0 + 1e-16, 0.5, 0.75, 0.0, "without it")
     chosen = replace(conclude().identification, selection=(first, second))
     parts = template_environment().get_template("parts.html").module
     rows = re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', parts.evidence(chosen))  # type: ignore[attr-defined]
     assert [(term, re.findall(r">([^<]+)</td>", cells)) for term, cells in rows] == [
-        ("y(k-1)", ["0.5830", "0.4170"]),
-        ("u(k-1)", ["0.4170", "0"]),
+        ("y(k-1)", ["0.5830", "0.4170", "1.000"]),
+        ("u(k-1)", ["0.4170", "0", "0.7500"]),
     ]
     assert "Selected term" not in parts.evidence(conclude().identification)  # type: ignore[attr-defined]
