@@ -36,8 +36,8 @@ def read_outcome_rows(
         match_outcomes(session, jobs), Run.state == JobState.SUCCEEDED, Run.deleted_at.is_(None)
     )
     return [
-        OutcomeRow(*values[: len(row)], dict(zip(parts, values[len(row) :], strict=True)))
-        for values in session.execute(query)
+        OutcomeRow(job, run, cell, labels, fit, validated, dict(zip(parts, values, strict=True)))
+        for job, run, cell, labels, fit, validated, *values in session.execute(query)
     ]
 
 

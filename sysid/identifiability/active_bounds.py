@@ -8,6 +8,7 @@ squared error. The error is that of a linear step of all parameters, inside the 
 """
 
 from collections.abc import Callable
+from math import log
 from typing import NamedTuple
 
 import numpy as np
@@ -126,10 +127,11 @@ def find_holding_bounds(
         return ()
     correlation = max(float(influence[1:] @ influence[:-1]) / total, 0.0)
     samples = influence.size * (1.0 - correlation) / (1.0 + correlation)
-    needed = np.log(_STRONG_ODDS) + 0.5 * np.log(max(samples, 1.0))
+    needed = log(_STRONG_ODDS) + 0.5 * log(max(samples, 1.0))
 
     def is_worth(before: float, after: float) -> bool:
-        return 0.5 * samples * np.log(before / max(after, _TIE_TOLERANCE * total)) > needed
+        gain = 0.5 * samples * log(before / max(after, _TIE_TOLERANCE * total))
+        return gain > needed
 
     return _release_in_turn(space, limits, influence, columns, point, is_worth)
 

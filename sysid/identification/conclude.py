@@ -16,7 +16,11 @@ from sysid.identification.best_estimate import IslandEnd, find_best_estimate, is
 from sysid.identification.budget import Budget
 from sysid.identification.deadline import Clock, Deadline
 from sysid.islands.run_state import RunState
-from sysid.judgement.agreement import find_constant_outputs, find_disagreement
+from sysid.judgement.agreement import (
+    find_better_yardstick,
+    find_constant_outputs,
+    find_disagreement,
+)
 from sysid.judgement.conclusions import (
     conclude_estimates,
     conclude_verdict,
@@ -53,6 +57,7 @@ from sysid.judgement.unstable_run import (
     find_misled_run,
 )
 from sysid.judgement.validation import find_contradictions, split_outputs, validate_estimates
+from sysid.judgement.yardstick import fit_yardstick
 from sysid.minima.minima import mark_ambiguous
 from sysid.minima.search_evidence import assess_search, is_explained
 from sysid.noise_models.generalised_least_squares import resolve_noise_model
@@ -179,11 +184,19 @@ def _build_identification(
         metrics.rms,
         run_residual_tests(problem, simulated, "estimation") if any(times.values()) else tests,
     )
+    is_white = analysis.uncertainty is None or analysis.uncertainty.noise_colour == "white"
+    measures = compares_orders and not is_white  # beside white residuals nothing is better
+    yardstick = fit_yardstick(problem, simulated) if measures else None
     is_of_the_solver = metrics.rms <= SOLVER_SHARE * problem.output_scale
     findings = order_findings(
         [
             *find_disagreement(metrics, limit, are_residuals_noise=are_noise),
             *find_constant_outputs(problem),
+            *find_better_yardstick(
+                yardstick,
+                [one.name for one in estimates if one.is_free],
+                is_explained=any(one.gain for one in explained.findings),
+            ),
             *find_unsettled(
                 evidence, estimates, lambda: find_cause_in_bounds(problem, theta, analysis)
             ),

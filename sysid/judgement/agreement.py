@@ -7,6 +7,7 @@ import numpy as np
 
 from sysid.core.text import join_names
 from sysid.core.units import format_unit
+from sysid.judgement.yardstick import Yardstick
 from sysid.results.findings import Finding
 from sysid.simulation.fit_metrics import ChannelMetrics, Metrics
 from sysid.simulation.problem import Problem
@@ -50,6 +51,29 @@ def find_disagreement(
             status="refuted",
         )
     yield from _find_straight_lines(metrics.channels)
+
+
+def find_better_yardstick(
+    yardstick: Yardstick | None, names: Sequence[str], *, is_explained: bool
+) -> Iterator[Finding]:
+    """Find a linear black box that predicts left-out blocks clearly better than the model.
+
+    It says that the model fails, not why. So beside an explanation (`is_explained`) it is a note.
+    """
+    if yardstick is None or not yardstick.is_clearly_better:
+        return
+    own, other = yardstick.own_fit_percent, yardstick.fit_percent
+    yield Finding(
+        "linear black box",
+        "structure",
+        "note" if is_explained else "caution",
+        f"a linear model of order {yardstick.order} explains {other:.0f} %, yours {own:.0f} %",
+        f"a linear model of order {yardstick.order} explains {other:.1f} % of {yardstick.output} "
+        f"in blocks that were left out of it, and this model {own:.1f} % of the same samples.",
+        "Choose another model, or look at channels and bounds.",
+        None if is_explained else 2.0 * yardstick.gain,
+        parameters=() if is_explained else tuple(names),
+    )
 
 
 def find_constant_outputs(problem: Problem) -> Iterator[Finding]:

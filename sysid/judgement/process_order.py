@@ -110,14 +110,10 @@ def compare_orders(
     entries = list_neighbouring_orders(assumptions.process)
     if max_simulations is not None and max_simulations < _MAX_SIMULATIONS * len(entries):
         return None, 0
-    fits, spent = list[_FittedOrder](), 0
-    for entry in entries:
-        fitted = _fit_order(problem, entry, assumptions, is_late)
-        if fitted is None:
-            return None, spent
-        spent += fitted.evaluations
-        fits.append(fitted)
-    if len(fits) < 2:
+    tried = [_fit_order(problem, entry, assumptions, is_late) for entry in entries]
+    fits = [fitted for fitted in tried if fitted is not None]
+    spent = sum(fitted.evaluations for fitted in fits)
+    if len(fits) < max(2, len(tried)):
         return None, spent
     has_colour = problem.loss.noise_model == "ar1" or _has_coloured_residuals(fits[-1])
     compared, contexts, bounded = list[OrderFit](), dict[str, ResidualContext](), set[str]()
@@ -165,12 +161,10 @@ def _judge_fit(
 def find_other_orders(
     comparison: OrderComparison | None, model: str, estimates: Sequence[Estimate]
 ) -> Iterator[Finding]:
-    """Find orders that the data prefer, or find as likely, and that move the dead time.
+    """Find orders that the data prefer, or do not rule out, and that move the dead time.
 
-    An order that was chosen by one who knows the plant has the odds that would exclude another
-    (`STRONG_ODDS`). So others count if they are as likely by the data. They move the dead time by
-    more than its interval. Another order is advised if nothing but noise is left by it. `model` is
-    the name of the model that was identified.
+    Those that count move it by more than its interval. Another order is advised if nothing but
+    noise is left by it. `model` is the name of the model that was identified.
     """
     if comparison is None or comparison.preferred_model == comparison.model:
         return
@@ -178,7 +172,7 @@ def find_other_orders(
     estimate = next(one for one in estimates if one.name == name)
     others = [fit for fit in comparison.open_fits if fit.model != own.model]
     best = min(others, key=lambda fit: fit.bic)
-    moved = [fit for fit in others if _is_moved(fit, own) and fit.bic < own.bic]
+    moved = [fit for fit in others if _is_moved(fit, own)]
     if comparison.preferred_model is None and not moved:
         return
     listed = ", ".join(_write_delay(comparison, fit) for fit in (own, *others))

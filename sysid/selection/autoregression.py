@@ -56,7 +56,7 @@ def fit_autoregression(parts: Sequence[FloatArray]) -> Autoregression:
     if most < 1 or not rows:
         return white
     lagged = np.concatenate(rows)
-    triangle = np.linalg.qr(np.column_stack([lagged[:, 1:], lagged[:, 0]]), mode="r")
+    triangle = np.asarray(np.linalg.qr(np.column_stack([lagged[:, 1:], lagged[:, 0]]), mode="r"))
     left = np.cumsum(np.square(triangle[::-1, -1]))[::-1]  # with 0, 1, … coefficients
     if left[-1] <= 0.0:
         return white

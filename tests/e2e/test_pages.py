@@ -93,8 +93,8 @@ def assert_residual_tests(page: Page) -> None:
         ".every(one => one.y.every(value => Math.abs(value) < 0.2))"
     )
     assert plot.evaluate(outside)
-    expect(page.locator("dl.findings")).to_contain_text("T + L = 0.46160 ± 0.00014")
-    expect(page.locator("dl.findings")).to_contain_text("Onset delay, p behind u")
+    expect(page.locator("dl.evidence")).to_contain_text("T + L = 0.46160 ± 0.00014")
+    expect(page.locator("dl.evidence")).to_contain_text("Onset delay, p behind u")
 
 
 def red_of(page: Page) -> int:

@@ -268,8 +268,18 @@ def test_a_preferred_order_that_moves_nothing_is_a_note() -> None:
         OrderFit("fopdt", 1, 1.41, 0.01, {}, 0.02, 10.0),
         OrderFit("sopdt", 2, 1.4, 0.01, {}, 0.02, 30.0),
     ]
-    [found] = find_other_orders(compare_fits("sopdt", "L", "s", "white", fits), "sopdt", [LAG])
+    [found] = find_other_orders(compare_fits("sopdt", "L", "s", "white", fits, 300), "sopdt", [LAG])
     assert (found.severity, found.parameters, found.moves) == ("note", (), ())
+
+
+def test_an_order_that_explains_no_more_than_by_chance_is_not_open() -> None:
+    """With 200 samples one parameter more costs 5.3, so the odds alone never rule it out."""
+    first = OrderFit("fopdt", 1, 1.41, 0.01, {"T": 1.0}, 0.02, 10.0)
+    for gain, is_open in ((0.0, False), (3.8, False), (3.9, True)):
+        bic = 10.0 + np.log(200.0) - gain
+        second = OrderFit("sopdt", 2, 1.3, 0.01, {"T": 1.0, "r": 0.1}, 0.02, bic)
+        comparison = compare_fits("fopdt", "L", "s", "white", (first, second), 200)
+        assert [fit.is_open for fit in comparison.fits] == [True, is_open]
 
 
 def test_a_noisy_record_beside_a_quiet_one_does_not_blur_the_comparison() -> None:

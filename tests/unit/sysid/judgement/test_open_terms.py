@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sysid.diagnosis.open_terms import mark_selection_dependent
 
 from sysid.core.settings import GeneticAlgorithm
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
+from sysid.judgement.conclusions import conclude_estimates, conclude_verdict
+from sysid.judgement.open_terms import find_open_terms
 from sysid.models.model import Model, SelectedTerm, Selection
 from sysid.models.parse import parse_model
-from sysid.results.verdict import Evidence, judge_result
 from sysid.uncertainty.estimates import Estimate
 from tests.support.library.polynomials import TRUTH, document, frols, record_of
 
@@ -26,6 +26,10 @@ def select(*terms: SelectedTerm) -> Model:
     return replace(parse_model(document(["y(k-1)", "u(k-1)"])), selection=Selection(terms))
 
 
+def judge(estimates: tuple[Estimate, ...], model: Model) -> tuple[Estimate, ...]:
+    return conclude_estimates(estimates, list(find_open_terms(estimates, model)))
+
+
 CERTAIN = SelectedTerm("y(k-1)", 0.9, 0.9, 0.5, 0.999, 0.95, "")
 UNLIKELY = SelectedTerm("u(k-1)", 0.01, 0.91, 0.5, 0.2, 0.19, "without it")
 MOVED = SelectedTerm("u(k-1)", 0.01, 0.91, 0.5, 0.99, 0.7, "with u(k-2) besides")
@@ -33,34 +37,34 @@ MOVED = SelectedTerm("u(k-1)", 0.01, 0.91, 0.5, 0.99, 0.7, "with u(k-2) besides"
 
 def test_a_term_that_may_not_belong_to_the_model_is_not_identified() -> None:
     before = (estimate("a[y(k-1)]"), estimate("a[u(k-1)]"), estimate("dk"))
-    first, second, lag = mark_selection_dependent(before, select(CERTAIN, UNLIKELY))
+    first, second, lag = judge(before, select(CERTAIN, UNLIKELY))
     assert (first, lag) == (before[0], before[2])
-    assert second.status == "selection-dependent"
+    assert second.status == "dependent"
     assert "probability of 20 %" in second.reason
     assert "without it" in second.reason
 
 
 def test_a_coefficient_that_other_selections_move_is_not_identified() -> None:
-    [one] = mark_selection_dependent((estimate("a[u(k-1)]"),), select(MOVED))
-    assert one.status == "selection-dependent"
+    [one] = judge((estimate("a[u(k-1)]"),), select(MOVED))
+    assert one.status == "dependent"
     assert "holds in 70 %" in one.reason
     assert "with u(k-2) besides" in one.reason
 
 
 def test_what_is_not_identified_for_another_reason_keeps_it() -> None:
     before = (estimate("a[u(k-1)]", "at bound"),)
-    assert mark_selection_dependent(before, select(UNLIKELY)) == before
-    assert mark_selection_dependent(before, parse_model(document("all"))) == before
+    assert judge(before, select(UNLIKELY)) == before
+    assert judge(before, parse_model(document("all"))) == before
 
 
 def test_the_verdict_counts_them_and_tells_why() -> None:
-    marked = mark_selection_dependent(
-        (estimate("a[y(k-1)]"), estimate("a[u(k-1)]")), select(CERTAIN, UNLIKELY)
-    )
-    verdict = judge_result(Evidence(estimates=marked, fit_percent=95.0))
+    before = (estimate("a[y(k-1)]"), estimate("a[u(k-1)]"))
+    findings = list(find_open_terms(before, select(CERTAIN, UNLIKELY)))
+    after = conclude_estimates(before, findings)
+    verdict = conclude_verdict(after, findings, ["a[y(k-1)]", "a[u(k-1)]"])
     assert verdict.trust == "limited"
     assert "1 of 2 coefficients depends on the selection of terms" in verdict.text
-    assert "without it" in verdict.reasons[0].text
+    assert "without it" in findings[0].text
 
 
 @pytest.mark.parametrize("seed", [11, 12, 13])
