@@ -60,15 +60,19 @@ class _Scored(NamedTuple):
 
 
 class Explained(NamedTuple):
-    """Findings about residuals; `is_done`: whether they were looked for."""
+    """Findings about residuals; `is_done`: whether they were looked for.
+
+    `is_doubtful`: something is likelier than noise alone, if not clearly.
+    """
 
     findings: tuple[Finding, ...] = ()
     is_done: bool = False
+    is_doubtful: bool = False
 
     @property
     def is_noise(self) -> bool:
-        """Whether no explanation moves an estimate: what is left is noise."""
-        return all(one.severity == "note" for one in self.findings)
+        """Whether no explanation is likelier than noise, or moves an estimate."""
+        return not self.is_doubtful and all(one.severity == "note" for one in self.findings)
 
 
 def explain_residuals(context: ResidualContext) -> Explained:
@@ -84,10 +88,11 @@ def explain_residuals(context: ResidualContext) -> Explained:
     taken, counted = np.zeros((context.times.size, 0)), 0
     candidates = list(_list_candidates(context, _PROPOSERS))
     scored = _score(context, candidates, taken, counted, base.criterion)
-    if any(_is_likely(one, context.times.size) for one in scored):
+    if base.is_coloured or any(_is_likely(one, context.times.size) for one in scored):
         costly = list(_list_candidates(context, _COSTLY_PROPOSERS))
         scored += _score(context, costly, taken, counted, base.criterion)
         scored = _refit_finalists(context, _order(scored), base.criterion)
+    is_doubtful = bool(scored) and 0.0 < scored[0].gain <= DEFECT_GAIN
     findings: list[Finding] = []
     while len(findings) < _MOST_FINDINGS:
         if not scored or scored[0].gain <= DEFECT_GAIN:
@@ -110,7 +115,7 @@ def explain_residuals(context: ResidualContext) -> Explained:
     findings += find_noise(context, base)
     if not findings:
         findings += find_disagreement_of_frequencies(context)
-    return Explained(tuple(findings), True)
+    return Explained(tuple(findings), True, is_doubtful)
 
 
 def _is_possible(context: ResidualContext) -> bool:
@@ -243,7 +248,7 @@ def _describe(
         "caution" if notable else "note",
         candidate.brief,
         text,
-        candidate.advice,
+        candidate.advice if notable else "",
         best.gain,
         moves,
         tuple(move.parameter for move in moves if move.parameter in notable),

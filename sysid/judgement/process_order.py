@@ -10,9 +10,8 @@ entry of the catalogue, at rest if the model is, else with free initial states, 
 step. Least squares starts from the estimate. A dead time that grows by the time constant that is
 left out keeps the sum of all.
 
-The criterion is Schwarz's (BIC, 1978). If the residuals of the highest order are not white, or the
-estimate has a noise model, each order has first-order noise of its own, with the correlation time
-of its largest likelihood. An order is preferred if its BIC is 6 lower than that of every other:
+The criterion is Schwarz's (BIC, 1978), as for all explanations (`sysid.judgement.residual_model`):
+each order has noise of its own, an autoregression that is estimated with it. An order is preferred if its BIC is 6 lower than that of every other:
 odds of 20 to 1 (Kass and Raftery 1995: strong evidence). Orders within 6 of the lowest are open,
 and the dead time lies in the range of theirs.
 """
@@ -43,7 +42,7 @@ from sysid.results.parts import OrderComparison, OrderFit, compare_fits
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.start_values import starts_at_rest
-from sysid.uncertainty.analysis import analyse_estimate, compute_criteria
+from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.estimates import Estimate
 
 _SUBSTEPS = 4  # of every order: a fast part needs them, and one step for all compares them fairly
@@ -188,7 +187,8 @@ def find_other_orders(
             f"{own.order}): its BIC is {own.bic - best.bic:.3g} lower. {name} is {listed}."
         )
         cure = "Give your model as many time constants, or use" if model != own.model else "Use"
-        advice = f"{cure} the model {best.model}." if best.leaves_noise else ""
+        is_cure = best.leaves_noise and best.order > own.order
+        advice = f"{cure} the model {best.model}." if is_cure else ""
     yield Finding(
         "order",
         "structure",
@@ -359,9 +359,8 @@ def _assess_order(
         spent += simulations
     residuals = problem.compute_residuals(theta[None])[0]
     analysis = analyse_estimate(problem, theta, whitening=whitening)
-    criteria = compute_criteria(
-        problem, residuals if whitening is None else whitening.whiten(residuals), whitening
-    )
+    context = ResidualContext(problem, theta, analysis)
+    used = theta.size * float(np.log(max(problem.n_scored, 2)))
     delay = next(estimate for estimate in analysis.estimates if estimate.name == "L")
     order = OrderFit(
         fitted.entry.model,
@@ -370,7 +369,6 @@ def _assess_order(
         delay.stderr,
         {estimate.name: estimate.value for estimate in analysis.estimates},
         float(np.sqrt(np.mean(np.square(residuals)))),
-        criteria.bic,
+        context.residual_model.without.criterion + used,
     )
-    context = ResidualContext(problem, theta, analysis)
     return order, context, delay.status == "at bound", spent + analysis.evaluations + 1

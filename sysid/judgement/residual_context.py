@@ -369,11 +369,19 @@ class ResidualContext:
             score = np.where(is_own, along**2 / np.where(is_own, rest, 1.0), 0.0)
             best = int(np.argmax(score))
             if score[best] > 0 and best not in found:
-                late, members = np.zeros(column.size), self._order[best : ends[best]]
-                late[members] = column[members]
-                moment = float(self.times[self._order[best]])
-                found[best] = (moment, late, self._describe_moment(best, moment))
+                found[best] = self._begin_late(column, best)
         return list(found.values())
+
+    def find_late(self, column: FloatArray) -> list[tuple[float, FloatArray, str]]:
+        """Let a column (n,) begin to count at each of the largest innovations, as `find_breaks`."""
+        places = {int(row): position for position, row in enumerate(self._order)}
+        return [self._begin_late(column, places[row]) for row in self.find_shocks()]
+
+    def _begin_late(self, column: FloatArray, position: int) -> tuple[float, FloatArray, str]:
+        late, members = np.zeros(column.size), self._order[position : self._ends[position]]
+        late[members] = column[members]
+        moment = float(self.times[self._order[position]])
+        return moment, late, self._describe_moment(position, moment)
 
     def find_shocks(self) -> list[int]:
         """Find the largest innovations, as numbers of samples."""

@@ -26,19 +26,21 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
     problem = context.problem
     if problem.prediction != "simulation":
         return
-    yield from _propose_inputs(context)
+    inputs = list(_propose_inputs(context))
+    yield from inputs
     yield from _propose_restarts(context)
     states, slopes = list_assumed_starts(problem), context.fixed_start_slopes
-    if slopes:
-        yield Candidate(
-            "start",
-            "start",
-            np.hstack(slopes),
-            "the record does not start as the model says",
-            f"the record does not start where the model says that {', '.join(states)} does",
-            "Use initial: free.",
-            is_added=True,
-        )
+    for before in (np.zeros((context.times.size, 0)), *(one.columns for one in inputs)):
+        if slopes:
+            yield Candidate(
+                "start",
+                "start",
+                np.hstack([*slopes, before]),
+                "the record does not start as the model says",
+                f"the record does not start where the model says that {', '.join(states)} does",
+                "Use initial: free.",
+                is_added=True,
+            )
 
 
 def _propose_restarts(context: ResidualContext) -> Iterator[Candidate]:

@@ -41,7 +41,8 @@ def _propose_courses(context: ResidualContext, name: str, rows: BoolArray) -> It
         f"Add drift*t to output {name} in the model's document, and drift to its parameters.",
         is_added=True,
     )
-    for moment, late, where in context.find_breaks(context.weigh(np.where(rows, 1.0, 0.0))[:, 0]):
+    offset = context.weigh(np.where(rows, 1.0, 0.0))[:, 0]
+    for moment, late, where in (*context.find_breaks(offset), *context.find_late(offset)):
         yield Candidate(
             "step of a sensor",
             "sensor",
