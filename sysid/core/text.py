@@ -14,7 +14,8 @@ RELATIVE_UNIT = "σ"
 SETTING = re.compile(
     r"(?<!\bthe model )\b(?P<field>\w+): "
     r"\{(?P<entries>[^{}:,]+: [^{}:,]+(?:, [^{}:,]+: [^{}:,]+)*)\}"
-    r"|\b(?P<name>prediction|initial): (?P<value>one-step|simulation|rest|free|measured|auto)\b"
+    r"|\b(?P<name>prediction|initial|skip): "
+    r"(?P<value>one-step|simulation|rest|free|measured|auto|\d+)\b"
 )
 """A field of a job in a note, as in a job file: ``loss: {noise_model: ar1}``.
 

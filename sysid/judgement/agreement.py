@@ -69,7 +69,7 @@ def find_better_yardstick(
         "note" if is_explained else "caution",
         f"a linear model of order {yardstick.order} explains {other:.0f} %, yours {own:.0f} %",
         f"a linear model of order {yardstick.order} explains {other:.1f} % of {yardstick.output} "
-        f"in blocks that were left out of it, and this model {own:.1f} % of the same samples.",
+        f"in blocks that were left out of it. This model explains {own:.1f} % of the same samples.",
         "Choose another model, or look at channels and bounds.",
         None if is_explained else 2.0 * yardstick.gain,
         parameters=() if is_explained else tuple(names),

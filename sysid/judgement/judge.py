@@ -62,7 +62,7 @@ class _Scored(NamedTuple):
 class Explained(NamedTuple):
     """Findings about residuals; `is_done`: whether they were looked for.
 
-    `is_doubtful`: something is likelier than noise alone, if not clearly.
+    `is_doubtful`: something has strong odds against noise alone, but not those of a defect.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -71,7 +71,7 @@ class Explained(NamedTuple):
 
     @property
     def is_noise(self) -> bool:
-        """Whether no explanation is likelier than noise, or moves an estimate."""
+        """Whether no explanation has strong odds against noise alone, or moves an estimate."""
         return not self.is_doubtful and all(one.severity == "note" for one in self.findings)
 
 
@@ -92,7 +92,7 @@ def explain_residuals(context: ResidualContext) -> Explained:
         costly = list(_list_candidates(context, _COSTLY_PROPOSERS))
         scored += _score(context, costly, taken, counted, base.criterion)
         scored = _refit_finalists(context, _order(scored), base.criterion)
-    is_doubtful = bool(scored) and 0.0 < scored[0].gain <= DEFECT_GAIN
+    is_doubtful = bool(scored) and STRONG_ODDS < scored[0].gain <= DEFECT_GAIN
     findings: list[Finding] = []
     while len(findings) < _MOST_FINDINGS:
         if not scored or scored[0].gain <= DEFECT_GAIN:

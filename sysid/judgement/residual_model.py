@@ -193,9 +193,3 @@ def _compute_lengths(products: FloatArray) -> FloatArray:
     """Compute the lengths (k,) of columns from their products (k, k); 1 of a column of zeros."""
     powers = np.diag(products)
     return np.sqrt(np.where(powers > 0, powers, 1.0))
-
-
-def _find_lengths(products: FloatArray) -> FloatArray:
-    """Find the lengths of columns by their products; 1 for a column of zeros."""
-    squares = np.diag(products)
-    return np.asarray(np.sqrt(np.where(squares > 0, squares, 1.0)))

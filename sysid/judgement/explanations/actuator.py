@@ -176,8 +176,8 @@ def _list_smoothings(name: str) -> Iterator[_Change]:
             "noise of an input",
             "input",
             f"{name} was recorded with noise",
-            f"a mean of {name} over {width} samples explains the output better than {name} itself: "
-            "its record has noise or steps of a converter that do not act on the plant",
+            f"a mean of {name} over {width} samples explains the output better than {name} itself. "
+            "Its record has noise or steps of a converter that do not act on the plant",
         )
 
 

@@ -5,7 +5,7 @@ explains, past values of the inputs explain: a model-error model (Ljung, Model v
 error modeling, 1999).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -33,6 +33,14 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             counted=1,
             is_vague=True,
         )
+    if context.problem.prediction == "simulation":  # predictions know the noise of their samples
+        yield from _propose_zero(context)
+    columns = list(_list_past_inputs(context))
+    if columns:
+        yield from _propose_dynamics(context, columns)
+
+
+def _propose_zero(context: ResidualContext) -> Iterator[Candidate]:
     yield Candidate(
         "zero of the response",
         "structure",
@@ -42,27 +50,31 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
         "Add a lead time (a zero) to the model.",
         is_vague=True,
     )
-    columns = list(_list_past_inputs(context))
-    if columns:
-        yield Candidate(
-            "missing dynamics",
-            "structure",
-            context.weigh(np.column_stack(columns)),
-            "a part of the response is missing",
-            "the residuals follow the inputs: a part of the response is missing from the model",
-            "Try a model of another structure.",
-            is_vague=True,
-        )
-        squares = [np.square(column) - np.mean(np.square(column)) for column in columns[::2]]
-        yield Candidate(
-            "missing nonlinearity",
-            "structure",
-            context.weigh(np.column_stack(squares)),
-            "a nonlinear part of the response is missing",
-            "the residuals follow squares of the inputs: the plant is less linear than the model",
-            "Try a nonlinear model.",
-            is_vague=True,
-        )
+
+
+def _propose_dynamics(
+    context: ResidualContext, columns: Sequence[FloatArray]
+) -> Iterator[Candidate]:
+    """Propose past values of the inputs, and their squares."""
+    yield Candidate(
+        "missing dynamics",
+        "structure",
+        context.weigh(np.column_stack(columns)),
+        "a part of the response is missing",
+        "the residuals follow the inputs: a part of the response is missing from the model",
+        "Try a model of another structure.",
+        is_vague=True,
+    )
+    squares = [np.square(column) - np.mean(np.square(column)) for column in columns[::2]]
+    yield Candidate(
+        "missing nonlinearity",
+        "structure",
+        context.weigh(np.column_stack(squares)),
+        "a nonlinear part of the response is missing",
+        "the residuals follow squares of the inputs: the plant is less linear than the model",
+        "Try a nonlinear model.",
+        is_vague=True,
+    )
 
 
 def _filter(values: FloatArray, samples: float) -> FloatArray:

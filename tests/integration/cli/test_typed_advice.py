@@ -19,7 +19,21 @@ from service.core.bodies.user_documents import parse_yaml
 from service.jobs.job_schemas import JobIn
 from service.plants.tube import Tube
 from sysid.core.text import SETTING, rewrite_settings
+from sysid.data.records import Record
 from sysid.identification.identify_arguments import write_setting
+from sysid.models.catalogue.load import catalogue
+from tests.support.library.defects import NOISES
+from tests.support.library.judged_records import (
+    FAST,
+    FINE,
+    NOISE,
+    SLOW,
+    draw_levels,
+    draw_noise,
+    draw_record,
+    hold,
+    make_record,
+)
 from tests.support.service.commands import run_lagid
 from tests.support.source_facts import list_modules
 
@@ -27,6 +41,8 @@ OPEN = "…"
 """Stands in a text for what is known when it is written."""
 VALUES = {("hold", OPEN): ("u", "zero"), ("loss", "scale"): ("scale", "0.3")}
 """Field and name of a setting → a name and a value for what is open in it."""
+NAMES = {"skip": ("8",), "initial": ("rest", "free")}
+"""A setting without entries whose value is open in a text → values of it."""
 OF_A_MODEL = {"history"}
 """Fields of the model's document that messages about this document write."""
 QUICK = ("--set", "algorithm.generations=2")
@@ -69,7 +85,14 @@ def list_settings() -> list[str]:
     """List the settings of jobs that notes advise, as job files have them."""
     found = [match for text in list_all_texts() for match in SETTING.finditer(text)]
     own = [match for match in found if not match["field"] or match["field"] not in OF_A_MODEL]
-    return sorted({fill(match) for match in own if "\n" not in match.string})
+    named = {
+        f"{name}: {value}"
+        for text in list_all_texts()
+        for name, values in NAMES.items()
+        if f"{name}: {OPEN}" in text
+        for value in values
+    }
+    return sorted({fill(match) for match in own if "\n" not in match.string} | named)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +116,8 @@ def identify(data: Path, *words: object, model: object = "fopdt") -> str:
 
 
 def test_settings_are_found_where_they_are_written() -> None:
-    some = {"hold: {u: zero}", "loss: {noise_model: ar1}", "prediction: one-step"}
+    some = {"hold: {u: zero}", "loss: {kind: soft-l1, scale: 0.3}", "prediction: one-step"}
+    some |= {"skip: 8", "initial: free", "initial: rest"}
     assert some <= {*list_settings()}
     assert {"validation.fraction=0.3", "parameters.L.upper=0.5"} <= {*list_changes()}
 
@@ -105,6 +129,66 @@ def test_a_setting_in_a_note_works_in_a_job_file_a_command_and_a_notebook(data: 
         identify(data, *shlex.split(FIELD_ORIGINS.rewrite_note(setting)))
         arguments = eval(f"dict({rewrite_settings(setting, write_setting)})", {"Loss": Loss})
         assert [*arguments] == [*given]
+
+
+def list_advice() -> list[str]:
+    """List what findings advise to use, as job files have it."""
+    texts = [text for path in list_modules(("sysid/judgement",)) for text in list_texts(path)]
+    return [
+        advice
+        for text in texts
+        for advice in re.findall(r"\b[Uu]se (\w+: (?:\{[^}]*\}|[^\s.,]+))", text)
+    ]
+
+
+def test_what_findings_advise_to_use_are_settings() -> None:
+    assert len(list_advice()) > 3
+    for advice in list_advice():
+        filled = [advice.replace(OPEN, value) for value in NAMES.get(advice.partition(":")[0], "x")]
+        for setting in filled:
+            assert FIELD_ORIGINS.rewrite_note(setting).startswith("--"), setting
+
+
+OUTLIERS = NOISES[0]
+
+
+def _start_elsewhere(seed: int) -> Record:
+    """A plant that is at rest with an input that the record does not have."""
+    u = draw_levels(seed)
+    y = FAST.respond(hold(u), u[0] + 0.5)[::FINE]
+    return make_record(u, y + NOISE * draw_noise(seed))
+
+
+DEFECTIVE: dict[str, tuple[Record, tuple[str, ...], str]] = {
+    "outliers": (OUTLIERS.draw(FAST, 4), (), "--set loss.kind=soft-l1"),
+    "a rest that is none": (_start_elsewhere(1), ("--set", "initial=rest"), "--set initial=free"),
+    "an order": (draw_record(SLOW, 1), (), "the model sopdt"),
+}
+"""Name → a record, options of its first identification, what is advised."""
+
+
+@pytest.mark.parametrize("name", DEFECTIVE)
+def test_the_advice_of_a_finding_is_typed_and_taken(name: str, tmp_path: Path) -> None:
+    record, options, expected = DEFECTIVE[name]
+    (u,), (y,) = record.inputs, record.outputs
+    path = tmp_path / "defect.csv"
+    rows = zip(u.times.tolist(), u.values.tolist(), y.values.tolist(), strict=True)
+    path.write_text("\n".join(["t,u,y", *(f"{t},{a:.6f},{b:.6f}" for t, a, b in rows)]))
+    search = ("--set", "algorithm.generations=20")
+    first = run_lagid("identify", path, "--model", "fopdt", *search, *options)
+    assert first.code == 0, first.stderr
+    printed = " ".join((first.stdout + first.stderr).split())
+    assert expected in printed
+    typed = re.findall(r"(?:--set \S+=\S+|--skip \d+|the model \w+)", printed)
+    words = {
+        word.rstrip(".,)") for word in typed if "noise_model" not in word and "hold" not in word
+    }
+    settings = [word.split() for word in words if word.startswith("--")]
+    models = [word.split()[-1] for word in words if word.startswith("the model ")]
+    model = next((one for one in models if one in catalogue()), "fopdt")
+    taken = [part for setting in settings for part in setting]
+    again = run_lagid("identify", path, "--model", model, *search, *taken)
+    assert again.code == 0, again.stderr
 
 
 def list_changes() -> list[str]:

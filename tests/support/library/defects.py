@@ -148,7 +148,7 @@ def _start_late(level: float) -> Defect:
 
 
 @dataclass(frozen=True)
-class Case:
+class DefectCase:
     """A defect, and the explanations that are true of it.
 
     Several are if no data can tell them apart. An offset y0 that jumps is a sensor that jumps, and
@@ -170,66 +170,66 @@ READINGS = ("reading of an input", "mean of a period")
 """A mean of the response to a held input is the response to straight lines, half a period later."""
 
 CONSTANCY = (
-    Case(
+    DefectCase(
         "the gain changes",
         _change_plant(LATE * 1.0, lambda p: replace(p, gain=1.3 * p.gain)),
         ("change of a parameter", "change of a unit"),
     ),
-    Case(
+    DefectCase(
         "a time constant changes",
         _change_plant(LATE * 1.0, lambda p: replace(p, times=(1.6 * p.times[0], *p.times[1:]))),
         ("change of a parameter",),
     ),
-    Case(
+    DefectCase(
         "the time lag changes",
         _change_plant(LATE * 1.0, lambda p: replace(p, delay=p.delay + 0.8)),
         ("change of a time lag", "jump of a clock"),
     ),
-    Case(
+    DefectCase(
         "the gain drifts",
         _change_plant(TIMES / TIMES[-1], lambda p: replace(p, gain=1.3 * p.gain)),
         ("drift of a parameter",),
     ),
-    Case(
+    DefectCase(
         "the time lag drifts",
         _change_plant(TIMES / TIMES[-1], lambda p: replace(p, delay=p.delay + 0.8)),
         ("drift of a time lag", "drift of a clock"),
     ),
 )
 SENSOR = (
-    Case(
+    DefectCase(
         "the sensor drifts",
         _change_output(lambda y: y + 0.3 * TIMES / TIMES[-1]),
         ("drift of a sensor", "drift of a parameter"),
     ),
-    Case(
+    DefectCase(
         "the sensor jumps",
         _change_output(lambda y: y + 0.3 * LATE),
         ("step of a sensor", "change of a parameter"),
     ),
-    Case(
+    DefectCase(
         "the unit changes",
         _change_output(lambda y: np.where(LATE, 1.3 * y - 0.6, y)),
         ("change of a unit",),
     ),
-    Case(
+    DefectCase(
         "the sensor is curved",
         _change_output(lambda y: y + 0.15 * (y - 1.0) ** 2),
         ("curve of a sensor",),
     ),
-    Case(
+    DefectCase(
         "the sensor is at its limit",
         _change_output(lambda y: np.clip(y, *np.quantile(y, [0.0, 0.8]))),
         ("limit of a sensor",),
     ),
-    Case("readings repeat", _repeat, ("repeated reading",)),
-    Case(
+    DefectCase("readings repeat", _repeat, ("repeated reading",)),
+    DefectCase(
         "the sensor is filtered",
         _change_output(_filter(6.0)),
         ("filter of a sensor", "one more time constant", "zero of the response"),
         seed=2,
     ),
-    Case(
+    DefectCase(
         "the input leaks into the output",
         lambda plant, seed: make_record(
             draw_levels(seed), _measure(plant, seed) + 0.03 * draw_levels(seed)
@@ -238,31 +238,33 @@ SENSOR = (
     ),
 )
 ACTUATOR = (
-    Case(
+    DefectCase(
         "the actuator is at its limit",
         _change_input(lambda u: np.minimum(u, 1.3)),
         ("limit of an actuator",),
     ),
-    Case("the actuator is curved", _change_input(lambda u: 0.5 * u**2), ("curve of an actuator",)),
-    Case("the actuator has backlash", _change_input(_play), ("backlash",)),
-    Case(
+    DefectCase(
+        "the actuator is curved", _change_input(lambda u: 0.5 * u**2), ("curve of an actuator",)
+    ),
+    DefectCase("the actuator has backlash", _change_input(_play), ("backlash",)),
+    DefectCase(
         "the actuator has a dead zone",
         _change_input(lambda u: np.sign(u - 1.0) * np.maximum(np.abs(u - 1.0) - 0.3, 0.0)),
         ("dead zone",),
     ),
-    Case("the actuator is slow", _change_input(_limit_rate), ("limit of the rate",), seed=2),
-    Case("the logged input is noisy", _log_noise, ("noise of an input",), QUICK),
+    DefectCase("the actuator is slow", _change_input(_limit_rate), ("limit of the rate",), seed=2),
+    DefectCase("the logged input is noisy", _log_noise, ("noise of an input",), QUICK),
 )
 LOADS = (
-    Case("a load begins", _load, ("load",), seed=2),
-    Case("a state jumps", _push, ("jump of the states",)),
+    DefectCase("a load begins", _load, ("load",), seed=2),
+    DefectCase("a state jumps", _push, ("jump of the states",)),
 )
 READING = (
-    Case("the input runs in lines", _interpolate, READINGS, QUICK),
-    Case("the output is a mean", _average_output, READINGS, QUICK),
+    DefectCase("the input runs in lines", _interpolate, READINGS, QUICK),
+    DefectCase("the output is a mean", _average_output, READINGS, QUICK),
 )
 HISTORY = (
-    Case(
+    DefectCase(
         "the input moved before the record",
         _move_before,
         ("input before the record",),
@@ -270,7 +272,7 @@ HISTORY = (
     ),
 )
 STRUCTURE = (
-    Case(
+    DefectCase(
         "a time constant is missing",
         _change_plant(TIMES * 0 + 1, lambda p: replace(p, times=(*p.times, 2.0))),
         ("one more time constant", "zero of the response", "missing dynamics"),
@@ -278,6 +280,6 @@ STRUCTURE = (
     ),
 )
 NOISES = (
-    Case("there are outliers", _change_output(_spoil), ("outliers",), seed=4),
-    Case("the noise grows", _grow, ("unequal variance",)),
+    DefectCase("there are outliers", _change_output(_spoil), ("outliers",), seed=4),
+    DefectCase("the noise grows", _grow, ("unequal variance",)),
 )

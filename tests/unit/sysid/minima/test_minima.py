@@ -138,31 +138,31 @@ def test_lags_a_period_apart_are_listed_where_the_start_is_skipped() -> None:
 
 
 @pytest.fixture(scope="module")
-def assumed() -> Identification:
+def wrongly_assumed() -> Identification:
     """A periodic input whose values before the record are assumed wrongly."""
     return identify(lag_model(), make_record(periodic(500), 200), seed=3)
 
 
 def test_lags_a_period_apart_are_listed_though_an_assumed_input_tells_them_apart(
-    assumed: Identification,
+    wrongly_assumed: Identification,
 ) -> None:
-    assert find_status(assumed, "L") == "ambiguous"
-    assert "where the input is recorded" in find_reason(assumed, "L")
+    assert find_status(wrongly_assumed, "L") == "ambiguous"
+    assert "where the input is recorded" in find_reason(wrongly_assumed, "L")
     told = "Its first value is assumed there, and the data contradict it."
-    assert sum(told in text for text in assumed.warnings) == 1
-    compared = [one for one in assumed.search.minima if one.recorded_from is not None]
+    assert sum(told in text for text in wrongly_assumed.warnings) == 1
+    compared = [one for one in wrongly_assumed.search.minima if one.recorded_from is not None]
     assert len([one for one in compared if one.is_compatible]) == 3
-    assert list_told(assumed) == pytest.approx([LAG + PERIOD, LAG + 2 * PERIOD], abs=0.05)
+    assert list_told(wrongly_assumed) == pytest.approx([LAG + PERIOD, LAG + 2 * PERIOD], abs=0.05)
 
 
 @pytest.mark.xfail(strict=True, reason="a contradiction and an explanation tell the same")
-def test_an_assumed_input_is_told_once(assumed: Identification) -> None:
-    assert sum("assumed" in text for text in assumed.warnings) == 1
+def test_an_assumed_input_is_told_once(wrongly_assumed: Identification) -> None:
+    assert sum("assumed" in text for text in wrongly_assumed.warnings) == 1
 
 
 @pytest.mark.xfail(strict=True, reason="what gains 383 and moves nothing is taken for noise")
-def test_an_assumed_input_is_no_noise(assumed: Identification) -> None:
-    assert assumed.noise_model == "white"
+def test_an_assumed_input_is_no_noise(wrongly_assumed: Identification) -> None:
+    assert wrongly_assumed.noise_model == "white"
 
 
 def test_lags_a_period_apart_are_listed_though_few_samples_are_skipped() -> None:

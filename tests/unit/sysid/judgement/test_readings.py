@@ -1,0 +1,96 @@
+"""Holds chosen by the data: what the other reading would give, and whether it is as likely."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sysid.data.records import Channel, Record
+from sysid.judgement.input_hold import (
+    find_other_readings,
+    list_input_holds,
+    replace_holds,
+    write_hold,
+)
+from sysid.models.catalogue.load import load_model
+from sysid.results.findings import Finding
+from sysid.results.parts import InputHold
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.estimates import Estimate
+from tests.support.library.judged_records import (
+    FAST,
+    STEP,
+    N,
+    draw_levels,
+    draw_record,
+    make_record,
+)
+
+LAG = Estimate("L", "s", 2.0, 0.0, 5.0, 0.01, (1.98, 2.02), "identified")
+GAIN = Estimate("K", "1", 2.0, 0.0, 5.0, 0.01, (1.98, 2.02), "identified")
+PROBLEM = Problem.build(load_model("fopdt"), [draw_record(FAST, 1)])
+HELD = InputHold("u", "zero", "has two levels", "first", {"L": 2.3, "K": 2.005}, 0.1)
+LINES = InputHold("u", "first", "varies smoothly", "zero", {"L": 1.7, "K": 2.005}, 0.1)
+
+
+def find(hold: InputHold, doubt: str = "", rms: float = 0.1) -> list[Finding]:
+    return list(find_other_readings(PROBLEM, [hold], [doubt], [GAIN, LAG], rms))
+
+
+def test_a_reading_in_doubt_that_leaves_an_interval_makes_that_estimate_dependent() -> None:
+    (found,) = find(LINES, "Its samples do not follow each other")
+    assert (found.severity, found.parameters, found.status) == ("caution", ("L",), "dependent")
+    assert found.brief == "u may be read held"
+    assert "L = 1.7 s instead of 2" in found.text
+    assert "Its samples do not follow each other." in found.text
+    assert found.moves[0].parameter == "L"
+    assert found.moves[0].stderrs == pytest.approx(-30.0)
+    assert found.advice == ""  # both fit as well
+
+
+def test_a_reading_that_fits_clearly_better_is_the_advice() -> None:
+    (found,) = find(replace(LINES, rms_other=0.09), "That fits better")
+    assert found.gain == pytest.approx(2 * PROBLEM.n_scored * np.log(0.1 / 0.09))
+    assert found.advice == "Use hold: {u: zero}."
+
+
+def test_a_doubt_that_moves_nothing_is_a_note() -> None:
+    (found,) = find(replace(LINES, estimates_other={"L": 2.001, "K": 2.0}), "It follows")
+    assert (found.severity, found.parameters) == ("note", ())
+    assert "the same estimates" in found.text
+
+
+def test_what_held_samples_would_give_as_lines_is_a_note_if_it_moves_an_estimate() -> None:
+    (found,) = find(HELD)
+    assert (found.severity, found.parameters) == ("note", ())
+    assert "Read as straight lines (hold: {u: first})" in found.text
+    assert find(replace(HELD, estimates_other={"L": 2.001, "K": 2.0})) == []
+
+
+def test_of_lines_without_a_doubt_and_of_a_given_hold_nothing_is_told() -> None:
+    assert find(LINES) == []
+    assert find(InputHold("u", "zero", None)) == []
+
+
+def test_each_input_is_listed_with_the_reading_that_it_does_not_have() -> None:
+    (hold,) = list_input_holds(PROBLEM)
+    assert hold == InputHold("u", "zero", None)  # given
+    record = make_record(draw_levels(1), draw_levels(1), reading="auto")
+    problem = Problem.build(load_model("fopdt"), [record])
+    (chosen,) = list_input_holds(problem)
+    assert (chosen.chosen, chosen.other) == ("zero", "first")
+    assert write_hold(chosen) == "hold: {u: first}"
+    other = replace_holds(problem, [chosen])
+    assert other.records[0].inputs[0].effective_hold == "first"
+    assert problem.records[0].inputs[0].effective_hold == "zero"
+
+
+def test_jumps_between_irregular_samples_are_uncertain_by_a_period() -> None:
+    times = np.cumsum(np.random.default_rng(1).uniform(0.3, 0.7, N))
+    u = draw_levels(1)
+    record = Record((Channel("u", times, u),), (Channel("y", times, u),))
+    problem = Problem.build(load_model("fopdt"), [record])
+    notes = find_other_readings(problem, list_input_holds(problem), [""], [GAIN, LAG], 0.1)
+    (found,) = (one for one in notes if one.explanation == "irregular sampling")
+    period = float(found.text.rpartition(", ")[2].removesuffix(" s"))
+    assert period == pytest.approx(STEP, rel=0.2)
