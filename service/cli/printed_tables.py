@@ -23,7 +23,7 @@ from service.client.calls import ProblemError
 from service.core.bodies.job_fields import DATASETS_PATH
 from service.core.label_text import format_labels
 from service.trends.trend_text import PLAIN, build_tables, format_reference, list_notes
-from sysid.core.text import append_unit, join_names, plain_unit
+from sysid.core.text import append_unit, plain_unit
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -69,13 +69,12 @@ def print_run(run: Mapping[str, Any], as_json: bool) -> None:
 
 
 def _list_untold_reasons(run: Mapping[str, Any]) -> list[str]:
-    """List the reasons of statuses that no finding tells, each once with its parameters."""
-    told = {name for one in run["findings"] for name in one["parameters"]}
-    names: dict[str, list[str]] = {}
-    for parameter in run["parameters"]:
-        if parameter["reason"] and parameter["name"] not in told:
-            names.setdefault(parameter["reason"], []).append(parameter["name"])
-    return [f"{join_names(some)}: {reason}" for reason, some in names.items()]
+    from sysid.core.value_documents import decode  # late: other commands start faster
+    from sysid.results.findings import Finding, list_untold_reasons
+    from sysid.uncertainty.estimates import Estimate
+
+    estimates = decode(tuple[Estimate, ...], run["parameters"])
+    return list_untold_reasons(estimates, decode(tuple[Finding, ...], run["findings"]))
 
 
 def print_reuse_note(job: Mapping[str, Any], runs: Sequence[Mapping[str, Any]], cure: str) -> None:

@@ -195,6 +195,13 @@ def format_delay_text(fit: OrderFit, unit: str) -> str:
     return text if text == DASH else text + plain_unit(unit)
 
 
+def select_told_orders(result: Result) -> OrderComparison | None:
+    """Select the comparison of orders, unless it would reassure beside another doubt."""
+    doubts = [one for one in result.findings if one.severity != "note"]
+    is_told = not doubts or any(one.explanation == "order" for one in doubts)
+    return result.order_comparison if is_told else None
+
+
 def format_excess_bic(fit: OrderFit, comparison: OrderComparison) -> str:
     """Format the BIC of an order, less the lowest of all orders."""
     lowest = min((one.bic for one in comparison.fits if isfinite(one.bic)), default=0.0)
@@ -224,6 +231,7 @@ RESULT_FILTERS = {
     "onset_note": describe_onset,
     "group_text": describe_group,
     "search_text": describe_search,
+    "told_orders": select_told_orders,
     "delay_text": format_delay_text,
     "excess_bic": format_excess_bic,
     "equations": list_equations,

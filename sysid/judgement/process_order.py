@@ -11,9 +11,9 @@ step. Least squares starts from the estimate. A dead time that grows by the time
 left out keeps the sum of all.
 
 The criterion is Schwarz's (BIC, 1978), as for all explanations (`sysid.judgement.residual_model`):
-each order has noise of its own, an autoregression that is estimated with it. An order is preferred if its BIC is 6 lower than that of every other:
-odds of 20 to 1 (Kass and Raftery 1995: strong evidence). Orders within 6 of the lowest are open,
-and the dead time lies in the range of theirs.
+each order has noise of its own, an autoregression that is estimated with it. An order is preferred
+if its BIC is 6 lower than that of every other: odds of 20 to 1 (Kass and Raftery 1995: strong
+evidence). Orders within 6 of the lowest are open, and the dead time lies in the range of theirs.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -127,8 +127,10 @@ def list_untold_reasons(estimates: Sequence[Estimate], findings: Sequence[Findin
     ['L: it was fixed']
     """
     told = {name for one in findings for name in one.parameters}
+    is_for_all = any(one.severity == "serious" and not one.parameters for one in findings)
     names: dict[str, list[str]] = {}
     for estimate in estimates:
-        if estimate.reason and estimate.name not in told:
+        is_told = estimate.name in told or (is_for_all and estimate.status == "dependent")
+        if estimate.reason and not is_told:
             names.setdefault(estimate.reason, []).append(estimate.name)
     return [f"{join_names(some)}: {reason}" for reason, some in names.items()]

@@ -96,7 +96,10 @@ def test_an_outlier_moves_neither_its_own_law_nor_what_a_reference_expects(place
         assert "the laws leave out the outlier at 5" in quantity.notes
         assert all(point.is_used for point in other.points)
     with place.database.read_session() as session:
-        pages = [job_page(session, place.store, first, "", outliers=one) for one in ("exclude", "include")]
+        pages = [
+            job_page(session, place.store, first, "", outliers=one)
+            for one in ("exclude", "include")
+        ]
     for text, query in zip(pages, ("", "?outliers=include"), strict=True):
         assert f'/figures/trend{query}" style' in text
         assert f'/jobs/{first}{query}#trend" aria-current="true"' in text

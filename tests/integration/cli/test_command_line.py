@@ -19,6 +19,7 @@ from fastapi import FastAPI
 from fastapi.responses import PlainTextResponse
 
 from service.api.app import create_app
+from service.cli.identify_command import FIELD_ORIGINS
 from service.client.embedded import find_free_port
 from service.storage.migrate import find_head_revision
 from sysid.core.errors import InvalidSettings
@@ -249,15 +250,16 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
         result,
     )
     assert done.code == 0, done.stderr
-    assert "±" in done.stdout
-    assert "Read as straight lines (--set hold.u=first) it would give" in " ".join(
-        done.stderr.split()
-    )
-    found = {one["name"]: one for one in json.loads(result.read_text())["parameters"]}
+    document = json.loads(result.read_text())
+    assert done.stdout.startswith(f"verdict: {document['verdict']['text']}\n")
+    notes = " ".join(done.stderr.split())
+    assert document["warnings"]
+    for text in document["warnings"]:
+        assert f"note: {FIELD_ORIGINS.rewrite_note(text)}" in notes
+    found = {one["name"]: one for one in document["parameters"]}
     truth = {"K": 2.0, "T": 1.0, "L": 0.5}
     for name, value in truth.items():
         assert np.isclose(found[name]["value"], value, atol=0.2)
-    document = json.loads(result.read_text())
     assert document["fit_percent"]["validation"] > 80
     assert f"; validation RMS {document['rms_validation']:.6g}" in done.stdout
     verdict = "passed" if json.loads(result.read_text())["residual_tests"]["passed"] else "failed"

@@ -11,6 +11,7 @@ from service.pages.result_filters import describe_soundness, tabulate_explanatio
 from sysid.residuals.residual_tests import ResidualTests
 from sysid.results.findings import Finding, Move, note
 from sysid.results.identification import Identification
+from sysid.results.parts import OrderFit, compare_fits
 from sysid.results.verdict import Verdict
 from tests.support.storage.run_results import conclude
 
@@ -120,3 +121,14 @@ def test_a_sound_result_says_what_was_tested(
     assert describe_soundness(found).endswith("the data determine every parameter.")
     poor = [replace(one, status="at bound") for one in found.parameters]
     assert "every parameter" not in describe_soundness(replace(found, parameters=tuple(poor)))
+
+
+def test_orders_reassure_nobody_beside_another_doubt() -> None:
+    first = OrderFit("fopdt", 1, 1.55, 0.01, {"L": 1.55}, 0.027, -1264.0)
+    second = OrderFit("sopdt", 2, 1.33, 0.01, {"L": 1.33}, 0.019, -1200.0)
+    orders = compare_fits("fopdt", "L", "s", "white", (first, second), 300)
+    parts: Any = template_environment().get_template("parts.html").module
+    for findings, is_shown in (((), True), ((ORDER,), True), ((CHANGE,), False)):
+        text = str(parts.evidence(find(*findings, order_comparison=orders)))
+        assert ("sopdt" in text) is is_shown
+        assert "1.55" not in text  # the estimates have it

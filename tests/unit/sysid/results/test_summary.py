@@ -24,7 +24,7 @@ def find(**fields: Any) -> Identification:
 def compare(sopdt_bic: float) -> Any:
     first = OrderFit("fopdt", 1, 1.55, 0.01, {"L": 1.55}, 0.027, -1264.0)
     second = OrderFit("sopdt", 2, 1.33, 0.01, {"L": 1.33}, 0.019, sopdt_bic)
-    return compare_fits("fopdt", "L", "s", "white", (first, second))
+    return compare_fits("fopdt", "L", "s", "white", (first, second), 300)
 
 
 def test_the_order_is_told_without_a_second_value_of_the_model() -> None:
@@ -60,6 +60,9 @@ def test_reasons_of_statuses_are_told_once_and_outside_the_table() -> None:
     assert lines[-2:] == ["note: L is 1.3 s.", "note: K and L: it is at the end"]
     told = replace(CAUTION, parameters=("L",))
     assert list_untold_reasons(parameters, [told]) == ["K: it is at the end"]
+    failed = replace(CAUTION, severity="serious")
+    doubted = [replace(one, status="dependent", reason=failed.brief) for one in parameters]
+    assert list_untold_reasons(doubted, [failed]) == []
 
 
 def test_a_search_that_did_not_settle_is_told_by_its_finding() -> None:
