@@ -33,7 +33,7 @@ from sysid.judgement.integration_step import (
     halve_step,
     mark_changing,
 )
-from sysid.judgement.judge import Explained, explain_residuals
+from sysid.judgement.judge import MOST_SIMULATIONS, Explained, explain_residuals
 from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
 from sysid.judgement.starts import (
     FittedStart,
@@ -401,7 +401,9 @@ class _EstimateSearch:
 
     def explain(self, *, explains: bool) -> Explained:
         """Explain the residuals of least squares, if asked for or if their colour needs it."""
-        if not (explains or self._may_be_ar1()):
+        left = self._budget.count_left(self._reserved)
+        has_time = not self._deadline.is_past_grace() and (left is None or left >= MOST_SIMULATIONS)
+        if not has_time or not (explains or self._may_be_ar1()):
             return Explained()
         context = ResidualContext(self.problem, self.theta, self.analysis)
         explained = explain_residuals(context)

@@ -6,6 +6,7 @@ never make a verdict milder, nor a status.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from math import exp
 from typing import TYPE_CHECKING
 
 from sysid.core.text import join_names, plain_estimate, plain_unit
@@ -13,10 +14,17 @@ from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE
 from sysid.results.findings import Finding, Severity, note
 from sysid.results.verdict import Verdict
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
+from sysid.uncertainty.intervals import (
+    Alternative,
+    Mixture,
+    compose_interval,
+    keep_in_bounds,
+)
 
 if TYPE_CHECKING:
     from sysid.results.identification import Identification
 
+_MOST_GAIN = 100.0  # that tells from a larger one: the odds are beyond any doubt
 _MOST_REASONS = 2  # of an estimate, and in a verdict
 
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
@@ -67,11 +75,33 @@ def _conclude_estimate(estimate: Estimate, findings: Sequence[Finding]) -> Estim
     known = "" if estimate.status == "identified" else estimate.reason
     found = [_explain(estimate, one) for one in against if one.status != estimate.status]
     reasons = dict.fromkeys(reason for reason in (known, *found) if reason)
-    return replace(
+    marked = replace(
         estimate,
         status=max(statuses, key=_RANKS.index),
         reason="; ".join(list(reasons)[:_MOST_REASONS]),
     )
+    return _average(marked, against)
+
+
+def _average(estimate: Estimate, against: Sequence[Finding]) -> Estimate:
+    """Extend the interval to the mixture over the explanations that move an estimate.
+
+    Each has the weight of its odds against the model alone (Hoeting et al. 1999). A value beyond
+    the bounds is too far for a linear step, and says no more than that it is elsewhere.
+    """
+    others = [
+        Alternative(exp(0.5 * min(one.gain, _MOST_GAIN)), move.value, move.stderr)
+        for one in against
+        for move in one.moves
+        if move.parameter == estimate.name
+        and one.gain is not None
+        and move.stderr
+        and estimate.lower <= move.value <= estimate.upper
+    ]
+    if not others or not estimate.stderr:
+        return estimate
+    own = Alternative(1.0, estimate.value, estimate.stderr)
+    return keep_in_bounds([compose_interval(estimate, Mixture((own, *others)))])[0]
 
 
 def _is_against(finding: Finding, estimate: Estimate) -> bool:

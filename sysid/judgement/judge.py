@@ -42,6 +42,9 @@ _PROPOSERS = (
 )
 _COSTLY_PROPOSERS = (actuator.propose, actuator.propose_loads)
 """Each of their explanations takes a simulation: only if the residuals depend on anything."""
+MOST_SIMULATIONS = 500
+"""Of all explanations: a column takes one, a full fit some dozens."""
+
 _LIKELY = 0.01  # of a likelihood ratio: with some forty candidates, of which many are alike
 _MOST_FINDINGS = 3  # that are found beside each other
 _MOST_TOLD = 3  # moves in a sentence

@@ -185,21 +185,22 @@ class ResidualContext:
         scale = compute_physical_scale(self.problem, self.theta)
         moved, errors = fit.coefficients[:d] * scale, fit.errors[:d] * scale
         start = np.zeros(d) if before is None else before.coefficients[:d] * scale
+        ends = {number: [float(moved[number])] for number, _ in self.declared}
         if varies is not None:
             number, *shares = varies
             change = float(fit.coefficients[-1] * scale[number])
-            ends = [float(moved[number]) + share * change for share in shares]
-            moved[number] = max(ends, key=lambda end: abs(end - start[number]))
+            ends[number] = [float(moved[number]) + share * change for share in shares]
         known = {estimate.name: estimate for estimate in self.analysis.estimates}
         return _order_moves(
             Move(
                 name,
-                float(self.theta[number] + moved[number]),
+                float(self.theta[number] + end),
                 float(errors[number]),
-                float(moved[number] - start[number]) / stderr,
+                float(end - start[number]) / stderr,
             )
             for number, name in self.declared
             if (stderr := known[name].stderr)
+            for end in ends[number]
         )
 
     def refit(self, records: Sequence[Record]) -> "Refitted | None":

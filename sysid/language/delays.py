@@ -19,7 +19,7 @@ from sysid.language.value_intervals import bound_expression
 
 _PERIOD = Symbol("h", "period")
 _MAX_DELAY = {"difference": 1e6, "differential": 1e12}
-"""In samples or s: a longer one is that of a bound that was left out. A record is shorter anyway."""
+"""In samples or s: a longer one is that of a bound that was left out. Records are shorter."""
 
 
 class PastIndex(NamedTuple):

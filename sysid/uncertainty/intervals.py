@@ -267,8 +267,12 @@ class Mixture:
     alternatives: tuple[Alternative, ...]
 
     def apply(self, estimate: Estimate) -> Estimate:
-        """Replace the interval by that of the mixture."""
-        return replace(estimate, interval95=compute_mixture_interval(self.alternatives))
+        """Extend the interval by that of the mixture; it holds the estimate that is reported."""
+        if estimate.interval95 is None:
+            return estimate
+        pairs = (estimate.interval95, compute_mixture_interval(self.alternatives))
+        lower, upper = zip(*pairs, strict=True)
+        return replace(estimate, interval95=(min(lower), max(upper)))
 
 
 def compute_mixture_interval(alternatives: Sequence[Alternative]) -> Interval:
