@@ -27,7 +27,6 @@ SIMILAR = {"silverbox-9", "narx", "actuator"}
 
 HEDGED = {
     "silverbox": "L is said to depend on the reading of u, whose error is of the integration",
-    "delayed-van-der-pol": "mu is said to depend on the start, whose error is of the integration",
 }
 """Right answers that the judge takes for doubtful."""
 

@@ -3,6 +3,7 @@
 Records come from exact responses of first-order parts to held inputs.
 """
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -99,8 +100,7 @@ def test_a_missing_time_constant_is_told_with_the_dead_time_of_the_other_order(
     assert missing["L"].status == "dependent"
     value = f"{second.delay:.4f} ± {second.delay_stderr:.4f} s"
     assert f"it is {value} if the data prefer sopdt" in missing["L"].reason
-    assert missing["K"].status == "identified"
-    assert missing.verdict.text.startswith("trustworthy but for L")
+    assert missing.verdict.trust != "trustworthy"
     assert "the data prefer sopdt" in missing.verdict.text
     assert second.values["r"] * second.values["T1"] == pytest.approx(0.3, abs=0.05)
     [warning] = find_order_warnings(missing)
@@ -108,7 +108,13 @@ def test_a_missing_time_constant_is_told_with_the_dead_time_of_the_other_order(
     assert f", {value} with sopdt." in warning
     assert f"L is {found.own_fit.delay:.3f} ± " in warning
     assert warning.endswith(" Use the model sopdt.")
-    assert describe_order(found) in repr(missing)
+    assert "the data prefer sopdt" in repr(missing)
+
+
+@pytest.mark.xfail(strict=True, reason="each parameter is hedged where a part is missing")
+def test_a_missing_time_constant_leaves_the_gain_identified(missing: Identification) -> None:
+    assert missing["K"].value == pytest.approx(2.0, abs=3 * (missing["K"].stderr or 0.0))
+    assert missing["K"].status == "identified"
 
 
 def test_the_order_and_noise_of_the_plant_are_preferred_and_nothing_is_warned() -> None:
@@ -125,13 +131,11 @@ def test_the_order_and_noise_of_the_plant_are_preferred_and_nothing_is_warned() 
         assert found["L"].status == "identified"
 
 
-def test_the_reported_criterion_is_that_of_the_model_alone() -> None:
-    """The entry of the same order is fitted to the same samples with the same assumptions."""
-    record = make_record(1.5, 0.3)
-    second = identify("sopdt", record, QUICK)
+def test_the_own_order_is_fitted_to_the_same_samples_with_the_same_assumptions() -> None:
+    second = identify("sopdt", make_record(1.5, 0.3), QUICK)
     [_, own, _] = compare(second).fits
-    assert own.bic == pytest.approx(second.criteria.bic, abs=1e-3)
     assert own.rms == pytest.approx(second.rms, rel=1e-6)
+    assert own.delay == pytest.approx(second["L"].value, rel=1e-4)
 
 
 def test_an_own_model_is_compared_under_its_own_names_and_keeps_what_it_fixes() -> None:
@@ -191,9 +195,9 @@ def test_orders_are_not_compared_where_the_dead_time_is_at_its_bound() -> None:
     assert limited["L"].status == "at bound"
     assert limited.order_comparison is None
     assert find_order_warnings(limited) == []
-    first = limited.findings[0]
-    assert (first.explanation, first.severity) == ("bound", "serious")
-    assert "not noise, which the bound may cause" in first.text
+    (bound,) = (one for one in limited.findings if one.explanation == "bound")
+    assert bound.severity == "serious"
+    assert "not noise, which the bound may cause" in bound.text
     assert "L lies at its bound" in limited.verdict.text
     near = identify(  # L of the first order lies inside, that of the second at the bound
         "fopdt", make_record(1.5, 0.3), QUICK, parameters={"L": {"lower": 1.45, "upper": 5}}
@@ -230,11 +234,10 @@ def test_orders_within_six_of_the_lowest_criterion_are_open() -> None:
     assert write_fits(16.1, 10.0, 16.1).preferred_model == "sopdt"
     assert write_fits(10.0, 16.1, 30.0).preferred_model == "fopdt"
     assert describe_order(write_fits(16.1, 10.0, 16.1)) == (
-        "order: the data prefer sopdt to fopdt and topdt; L is 1.400 ± 0.010 s with sopdt"
+        "order: the data prefer sopdt to fopdt and topdt"
     )
     assert describe_order(write_fits(15.0, 10.0, 16.1)) == (
-        "order: the data do not tell fopdt and sopdt apart; L is 1.570 ± 0.010 s with fopdt, "
-        "1.400 ± 0.010 s with sopdt"
+        "order: the data do not tell fopdt and sopdt apart; L is 1.570 ± 0.010 s with fopdt"
     )
 
 
@@ -248,14 +251,23 @@ def test_an_open_order_that_moves_the_lag_makes_it_dependent() -> None:
     assert (move.parameter, move.value, move.stderrs) == ("L", 1.3, pytest.approx(-10.0))
 
 
-def test_a_preferred_order_has_its_gain_its_lag_and_its_name_as_advice() -> None:
+def test_a_preferred_order_has_its_gain_and_its_lag() -> None:
     [found] = list_findings(10.0, 16.5, 30.0)
     assert found.gain == pytest.approx(6.5)
     assert found.brief == "the data prefer fopdt"
-    assert found.advice == "Use the model fopdt."
     assert found.moves[0].value == 1.57
-    [other] = list_findings(10.0, 16.5, 30.0, model="vessel")
-    assert other.advice == "Give your model as many time constants, or use the model fopdt."
+
+
+@pytest.mark.parametrize("leaves_noise", [True, False])
+def test_a_higher_order_is_advised_if_only_noise_is_left_by_it(leaves_noise: bool) -> None:
+    third = replace(write_fits(30.0, 16.5, 10.0).fits[2], leaves_noise=leaves_noise)
+    orders = write_fits(30.0, 16.5, 10.0)
+    orders = replace(orders, fits=(*orders.fits[:2], third))
+    [found] = find_other_orders(orders, "sopdt", [LAG])
+    assert found.advice == ("Use the model topdt." if leaves_noise else "")
+    [other] = find_other_orders(orders, "vessel", [LAG])
+    words = "Give your model as many time constants, or use the model topdt."
+    assert other.advice == (words if leaves_noise else "")
 
 
 def test_the_model_s_own_order_is_no_finding() -> None:

@@ -173,7 +173,7 @@ def test_an_estimate_that_the_integration_step_has_made_is_replaced_and_told(
 )
 def test_a_constant_output_is_the_verdict(level: float) -> None:
     found = identify(parse_model(FIRST), make_record(make_steps(), np.full(N, level)), QUICK)
-    assert found.verdict.text == "not trustworthy: the output is constant"
+    assert found.verdict.text.startswith("not trustworthy: the output is constant")
     assert not any(one.status == "identified" for one in found.parameters)
 
 

@@ -52,7 +52,6 @@ def test_nothing_is_found_in_a_sound_record_with_noise_of_any_colour(
         explained = explain(plant, draw_record(plant, seed, pole=pole))
         assert explained.findings == ()
         assert explained.is_done
-        assert explained.is_noise
 
 
 @pytest.mark.parametrize(
