@@ -73,8 +73,8 @@ class ValidationIn(Body):
 class LossIn(Body):
     """Loss function: squares, or soft-l1 with a scale in the output's unit.
 
-    The noise model ar1 gives generalised least-squares estimates. auto selects the one that
-    predicts left-out data better, if the residuals are coloured, else white.
+    The noise model ar1 gives generalised least-squares estimates. auto selects it if the residuals
+    are coloured and nothing but noise explains them, else white.
     """
 
 

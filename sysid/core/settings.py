@@ -322,9 +322,9 @@ class Loss:
 
     With the noise model ``ar1`` the search minimises squares. Then generalised least squares
     under first-order noise gives the estimates
-    (`sysid.noise_models.generalised_least_squares`). ``auto`` selects, for free runs by
-    squares with coloured residuals, the one that predicts left-out data better
-    (`sysid.noise_models.noise_model_choice`), else ``white``.
+    (`sysid.noise_models.generalised_least_squares`). ``auto`` selects ``ar1`` for free runs by
+    squares whose coloured residuals have no other explanation (`sysid.judgement.judge`), else
+    ``white``.
 
     Attributes
     ----------

@@ -109,13 +109,13 @@ def _find_unidentifiable(free: Sequence[Estimate]) -> Iterator[Finding]:
     if grouped:
         names = [one.name for one in grouped]
         reasons = dict.fromkeys(one.reason for one in grouped if one.reason)
+        told = f": {'; '.join(reasons)}" if reasons else ""
         yield Finding(
             "combination",
             "identifiability",
             "caution",
             f"the data determine {join_names(names)} only in combination",
-            f"the data do not determine {join_names(names)} alone, only in combination"
-            f"{f': {chr(59).join(reasons)}' if reasons else ''}.",
+            f"the data do not determine {join_names(names)} alone, only in combination{told}.",
             "Use the combinations, or fix a parameter that you know.",
             parameters=tuple(names),
             status="group",

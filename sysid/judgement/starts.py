@@ -295,13 +295,38 @@ def _find_name(problem: Problem) -> StartKind | None:
 def _fit_starts(
     problems: Sequence[Problem], theta: FloatArray, steps: int, is_late: Callable[[], bool]
 ) -> tuple[list[RefinedCandidate | None], int]:
-    """Fit problems from an estimate of the first, then from the best end of the others."""
+    """Fit problems from an estimate of the first, then from the ends of the others.
+
+    One whose end is far behind is scanned for a lower minimum. If that is the lowest of all, the
+    others are fitted from it too: the estimate was in a false minimum.
+    """
     points = [convert_point(problems[0], one, theta) for one in problems]
     ends = [
         refine_candidates(one, [point], steps, is_late)[0]
         for one, point in zip(problems, points, strict=True)
     ]
     spent = sum(end.evaluations for end in ends if end)
+    spent += _fit_from_others(problems, ends, steps, is_late)
+    best = min((end.rms for end in ends if end), default=0.0)
+    for i, (one, end) in enumerate(zip(problems, ends, strict=True)):
+        if end is None or end.rms <= best * _compute_open_ratio(one):
+            continue
+        scanned = scan_by_projection(one, end, _SEED, _SCAN, is_late)
+        spent += scanned.evaluations
+        ends[i] = min((end, *scanned.ends), key=lambda found: found.rms)
+    if min((end.rms for end in ends if end), default=0.0) < best:
+        spent += _fit_from_others(problems, ends, steps, is_late)
+    return ends, spent
+
+
+def _fit_from_others(
+    problems: Sequence[Problem],
+    ends: list[RefinedCandidate | None],
+    steps: int,
+    is_late: Callable[[], bool],
+) -> int:
+    """Fit problems from the ends of the others, and keep what is lower; count the simulations."""
+    spent = 0
     for i, one in enumerate(problems):
         others = [
             convert_point(other, one, end.theta)
@@ -315,14 +340,7 @@ def _fit_starts(
             spent += candidate.evaluations
             if own is None or candidate.rms < own.rms:
                 ends[i] = own = candidate
-    best = min(end.rms for end in ends if end) if any(ends) else 0.0
-    for i, (one, end) in enumerate(zip(problems, ends, strict=True)):
-        if end is None or end.rms <= best * _compute_open_ratio(one):
-            continue
-        scanned = scan_by_projection(one, end, _SEED, _SCAN, is_late)
-        spent += scanned.evaluations
-        ends[i] = min((end, *scanned.ends), key=lambda found: found.rms)
-    return ends, spent
+    return spent
 
 
 def _compute_open_ratio(problem: Problem) -> float:

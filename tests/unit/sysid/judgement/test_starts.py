@@ -140,3 +140,21 @@ def test_a_lag_at_its_upper_bound_explains_nothing() -> None:
     assert free.bic < rest.bic
     assert [free.is_open, rest.is_open] == [False, True]
     assert comparison.best is rest
+
+
+def test_a_false_minimum_of_the_estimate_decides_no_start() -> None:
+    """Only the scan of a rest leaves it. So the other start is fitted from there as well."""
+    random = np.random.default_rng(1)
+    u = np.repeat(random.choice([-1.0, 1.0], N // 5), 5)
+    record = Record((Channel("u", TIMES, u, hold="zero"),), (Channel("y", TIMES, TIMES),))
+    truth = Problem.from_settings(load_model("fopdt"), [record], FitSettings(initial="free"))
+    true_values = {"K": 2.0, "T": 4.0, "L": 3.0, "y0": 0.0, "x(0)": 5.0}
+    y = truth.predict(np.array([[true_values[name] for name in truth.free_names]]))[0]
+    y = y + 0.1 * random.standard_normal(N)
+    measured = replace(record, outputs=(Channel("y", TIMES, y),))
+    problem = Problem.from_settings(load_model("fopdt"), [measured], FitSettings())
+    false = {"K": -0.4, "T": 4.0, "L": 60.0, "y0": 0.0, "x(0)": 5.0}
+    comparison = compare_starts(problem, np.array([false[name] for name in problem.free_names]))
+    assert comparison is not None
+    assert comparison.best.name == "free"
+    assert comparison.best.values["L"] == pytest.approx(3.0, abs=0.2)
