@@ -81,7 +81,7 @@ def render(found: Identification) -> str:
     shown = (
         parts.verdict_card(view),
         parts.explanations(found),
-        parts.estimates_table(found),
+        parts.estimates_table(found.parameters),
         parts.notes(found),
     )
     return re.sub(r"\s+", " ", " ".join(map(str, shown)))
