@@ -13,7 +13,6 @@ from sysid.judgement.explanations import (
     actuator,
     constancy,
     history,
-    numerics,
     reading,
     sensor,
     structure,
@@ -35,7 +34,6 @@ from sysid.judgement.residual_model import ColumnFit
 from sysid.results.findings import Finding, Move
 
 _PROPOSERS = (
-    numerics.propose,
     constancy.propose,
     sensor.propose,
     structure.propose,

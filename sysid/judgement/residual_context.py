@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sysid.core.errors import SysidError
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.core.units import format_unit
@@ -14,8 +15,8 @@ from sysid.data.interpolation import interpolate_channel
 from sysid.data.records import Channel, Record
 from sysid.judgement.residual_model import ColumnFit, Noise, ResidualModel
 from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
-from sysid.kernels.signals.past_reads import list_delayed_values
-from sysid.models.model import Model
+from sysid.kernels.signals.past_reads import is_difference, list_delayed_values
+from sysid.models.model import MAX_SUBSTEPS, Model, replace_substeps
 from sysid.models.ties import collect_parameter_names
 from sysid.residuals.series import ResidualPart, iterate_parts
 from sysid.results.findings import Family, Move
@@ -28,6 +29,7 @@ _EDGE_SHARE = 0.1  # of an experiment at either end, in which no change is looke
 _REFIT_STEPS = 12  # of least squares, from the estimate
 _AFTER = 0.01  # of a period: a held input has jumped then
 _MOST_STATES = 8  # whose starts are looked at
+_FINER = 4  # times as many integration steps
 _SHOCKS = 3  # innovations that are looked at
 _OWN_SHARE = 1e-6  # of a column that no parameter explains: less says nothing
 
@@ -129,10 +131,28 @@ class ResidualContext:
 
     @cached_property
     def residual_model(self) -> ResidualModel:
-        """Likelihood of the residuals under columns and coloured noise."""
+        """Likelihood of the residuals under columns and coloured noise.
+
+        Errors of the integration are taken out first. They are the program's, and no defect: an
+        input that jumps inside a step leaves one, and under coloured noise even a small one shows.
+        """
         assert self.analysis.residuals_and_sensitivities is not None
         error, columns = self.analysis.residuals_and_sensitivities
-        return ResidualModel(-error, columns, self.parts)
+        return ResidualModel(-error - self._integration_error, columns, self.parts)
+
+    @cached_property
+    def _integration_error(self) -> FloatArray:
+        """What a finer step adds to the weighted outputs (n,)."""
+        nothing = np.zeros(self.times.size)
+        model = self.problem.untied_model
+        steps = _FINER * model.solver.substeps
+        if is_difference(model) or steps > MAX_SUBSTEPS:
+            return nothing
+        try:
+            added = self.simulate(model=replace_substeps(model, steps)) - self.simulated
+        except SysidError:
+            return nothing
+        return self.weight * added if np.all(np.isfinite(added)) else nothing
 
     @cached_property
     def declared(self) -> list[tuple[int, str]]:

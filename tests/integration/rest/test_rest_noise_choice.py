@@ -80,7 +80,7 @@ def test_a_tank_has_generalised_least_squares_unless_squares_are_asked_for(
     )
     assert [one["noise_model"] for one in (auto, white, ar1)] == ["ar1", "white", "ar1"]
     assert read_values(auto) == read_values(ar1) != read_values(white)
-    assert sum("use loss: {noise_model: white}" in text for text in auto["warnings"]) == 1
+    assert sum("(loss: {noise_model: white})" in text for text in auto["warnings"]) == 1
     assert list_notes(plants, auto, white)
     assert not list_notes(plants, auto, ar1)
     faults = read_faults(

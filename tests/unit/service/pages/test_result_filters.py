@@ -8,6 +8,7 @@ import pytest
 
 from service.pages.render import template_environment
 from service.pages.result_filters import describe_soundness, tabulate_explanations
+from service.pages.trend_views import FlagCount
 from sysid.residuals.residual_tests import ResidualTests
 from sysid.results.findings import Finding, Move, note
 from sysid.results.identification import Identification
@@ -130,5 +131,24 @@ def test_orders_reassure_nobody_beside_another_doubt() -> None:
     parts: Any = template_environment().get_template("parts.html").module
     for findings, is_shown in (((), True), ((ORDER,), True), ((CHANGE,), False)):
         text = str(parts.evidence(find(*findings, order_comparison=orders)))
-        assert ("sopdt" in text) is is_shown
+        assert ('<table class="orders ' in text) is is_shown
+        assert ("strong evidence against" in text) is is_shown
+        assert ('data-label="BIC − lowest BIC">64.0</td>' in text) is is_shown
         assert "1.55" not in text  # the estimates have it
+
+
+def test_a_batch_without_flags_says_how_many_notes_it_has() -> None:
+    parts: Any = template_environment().get_template("parts.html").module
+    job = {
+        "is_open": False,
+        "outcome": None,
+        "error": None,
+        "progress": {"runs": 3, "finished": 3, "failed": 0},
+    }
+    for told, text in (
+        (FlagCount(0, 5), "no flags</span>, 5 notes"),
+        (FlagCount(0, 1), "no flags</span>, 1 note"),
+        (FlagCount(0, 0), "no flags</span> <small>"),
+        (FlagCount(1, 5), "1 flag</span> <small>"),
+    ):
+        assert text in str(parts.job_result(job, told))
