@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _MOST_REASONS = 2  # of an estimate, and in a verdict
 
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
+_OF_RECORD = ("constant output", "constant input")  # then nothing else says anything
 _OF_NOISE = ("outliers", "unequal variance", "coloured noise")
 _RANKS: tuple[EstimateStatus, ...] = (
     "identified",
@@ -43,6 +44,8 @@ def order_findings(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def _find_group(finding: Finding) -> int:
+    if finding.explanation in _OF_RECORD:
+        return -1
     is_clear = finding.gain is not None and finding.gain > DEFECT_GAIN
     if is_clear and finding.explanation not in _OF_NOISE:
         return 0

@@ -121,6 +121,8 @@ def _is_possible(context: ResidualContext) -> bool:
     if analysis.residuals_and_sensitivities is None or context.problem.loss_scale:
         return False
     error, columns = analysis.residuals_and_sensitivities
+    if context.problem.model.inputs and not context.moving_inputs:
+        return False  # nothing excites the plant
     return bool(np.any(error)) and error.size > 2 * columns.shape[1] + 10
 
 
@@ -235,7 +237,7 @@ def _describe(
         notable = {move.parameter for move in moves}
     text = f"{candidate.text}."
     if candidate.describe is not None:
-        text += f" {candidate.describe(best.fit)}"
+        text = f"{text} {candidate.describe(best.fit)}".rstrip()
     text += _tell_moves(context, moves)
     if rivals:
         others = dict.fromkeys(one.candidate.brief for one in rivals)
@@ -273,6 +275,7 @@ def _tell_moves(context: ResidualContext, moves: Sequence[Move]) -> str:
         f"{plain_unit(known[move.parameter].unit)} instead of {known[move.parameter].value:.4g}"
         for move in moves[:_MOST_TOLD]
         if abs(move.stderrs) > NOTABLE_MOVE
+        and known[move.parameter].lower <= move.value <= known[move.parameter].upper
     ]
     return f" With that, about {', '.join(told)}." if told else ""
 

@@ -18,7 +18,8 @@ from sysid.language.tree import Expression, PastValue, Symbol, walk
 from sysid.language.value_intervals import bound_expression
 
 _PERIOD = Symbol("h", "period")
-_MAX_DELAY = 1e6
+_MAX_DELAY = {"difference": 1e6, "differential": 1e12}
+"""In samples or s: a longer one is that of a bound that was left out. A record is shorter anyway."""
 
 
 class PastIndex(NamedTuple):
@@ -59,7 +60,8 @@ def _split_bounded(back: LaurentPolynomial, rest: Expression, scope: Scope) -> P
     if not back:
         return PastIndex(0, None)
     # Any period shows an unlimited delay; back[CONSTANT] counts samples or seconds.
-    if max(bound_expression(rest, scope.parameters, 1.0)[1], back.get(CONSTANT, 0.0)) > _MAX_DELAY:
+    longest = max(bound_expression(rest, scope.parameters, 1.0)[1], back.get(CONSTANT, 0.0))
+    if longest > _MAX_DELAY[scope.form]:
         written = format_expression(rest, scope.clock)
         return f"the delay {written} has no upper limit inside the bounds of its parameters"
     return PastIndex(0, rest) if scope.form == "differential" else _split_offset(back, low, scope)
