@@ -80,7 +80,7 @@ def _conclude_estimate(estimate: Estimate, findings: Sequence[Finding]) -> Estim
         status=max(statuses, key=_RANKS.index),
         reason="; ".join(list(reasons)[:_MOST_REASONS]),
     )
-    return _average(marked, against)
+    return marked if marked.status == "identified" else _average(marked, against)
 
 
 def _average(estimate: Estimate, against: Sequence[Finding]) -> Estimate:

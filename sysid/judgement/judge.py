@@ -46,6 +46,7 @@ MOST_SIMULATIONS = 500
 """Of all explanations: a column takes one, a full fit some dozens."""
 
 _LIKELY = 0.01  # of a likelihood ratio: with some forty candidates, of which many are alike
+_BY_ORDER = ("one more time constant", "filter of a sensor")  # another order is the full fit
 _MOST_FINDINGS = 3  # that are found beside each other
 _MOST_TOLD = 3  # moves in a sentence
 _MOST_REFITTED = 3  # explanations that are fitted in full
@@ -290,8 +291,10 @@ def select_explanations(
 
     Each of them was compared with the model alone, so they compete. Those with strong evidence
     against them, beside the likeliest one, are left out. What was found beside the likeliest one
-    stays with it.
+    stays with it. Another order that was fitted in full takes the place of its columns.
     """
+    if any(one.explanation == "order" and (one.gain or 0.0) > DEFECT_GAIN for one in refitted):
+        explained = [one for one in explained if one.explanation not in _BY_ORDER]
     names = {one.explanation for one in explained}
     refitted = [one for one in refitted if one.explanation not in names or not one.parameters]
     first = max((one.gain or 0.0 for one in explained), default=0.0)

@@ -83,7 +83,6 @@ def test_of_a_given_hold_nothing_is_told(hold: Hold) -> None:
     assert found.input_hold == (InputHold("u", hold, None),)
 
 
-@pytest.mark.xfail(strict=True, reason="explanations are looked for beyond the budget")
 def test_a_budget_is_kept() -> None:
     record = step_test().to_record({"u": "u"}, {"y": "y"})
     search = GeneticAlgorithm(generations=100, stop=Stop(evaluations=400))

@@ -127,7 +127,7 @@ def read_both_values(text: str) -> tuple[float, float]:
 
 def test_a_text_has_one_value_before_a_change() -> None:
     first = explain(FAST, CONSTANCY[1].draw(FAST, 3)).findings[0]
-    (value,) = (move.value for move in first.moves if move.parameter == "T")
+    value = next(move.value for move in first.moves if move.parameter == "T")
     assert read_both_values(first.text)[0] == pytest.approx(value, rel=1e-3)
 
 
