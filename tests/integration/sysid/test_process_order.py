@@ -111,7 +111,6 @@ def test_a_missing_time_constant_is_told_with_the_dead_time_of_the_other_order(
     assert "the data prefer sopdt" in repr(missing)
 
 
-@pytest.mark.xfail(strict=True, reason="each parameter is hedged where a part is missing")
 def test_a_missing_time_constant_leaves_the_gain_identified(missing: Identification) -> None:
     assert missing["K"].value == pytest.approx(2.0, abs=3 * (missing["K"].stderr or 0.0))
     assert missing["K"].status == "identified"
