@@ -20,8 +20,8 @@ from sysid.export.program import (
     time_loop,
     write_delay_steps,
 )
-from sysid.kernels.integrators import HALVINGS
 from sysid.language.functions import FUNCTIONS, Level
+from sysid.language.time_switches import HALVINGS
 from sysid.models.model import MeasuredInitial
 from sysid.simulation.grid import GRID_TOLERANCE
 

@@ -13,7 +13,7 @@ from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.core.units import format_unit
 from sysid.data.interpolation import interpolate_channel
 from sysid.data.records import Channel, Record
-from sysid.judgement.residual_model import ColumnFit, Noise, ResidualModel
+from sysid.judgement.residual_model import ColumnFit, OutputNoise, ResidualModel
 from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.kernels.signals.past_reads import is_difference, list_delayed_values
 from sysid.models.model import MAX_SUBSTEPS, Model, replace_substeps
@@ -109,12 +109,12 @@ class ResidualContext:
         return np.concatenate([part.times for part in self.parts])
 
     @cached_property
-    def simulated(self) -> FloatArray:
+    def simulation(self) -> FloatArray:
         """Simulated values (n,) of the scored samples."""
         return self._predict(self.problem)
 
     @cached_property
-    def measured(self) -> FloatArray:
+    def measurement(self) -> FloatArray:
         """Measured values (n,) of the scored samples."""
         return self.problem.evaluator.measured[self.problem.scored_rows]
 
@@ -125,7 +125,7 @@ class ResidualContext:
         for part in self.parts:
             if part.times.size > 1:
                 with np.errstate(all="ignore"):
-                    found = np.gradient(self.simulated[part.rows], part.times)
+                    found = np.gradient(self.simulation[part.rows], part.times)
                 slope[part.rows] = np.where(np.isfinite(found), found, 0.0)
         return slope
 
@@ -149,13 +149,13 @@ class ResidualContext:
         if is_difference(model) or steps > MAX_SUBSTEPS:
             return nothing
         try:
-            added = self.simulate(model=replace_substeps(model, steps)) - self.simulated
+            added = self.simulate(model=replace_substeps(model, steps)) - self.simulation
         except SysidError:
             return nothing
         return self.weight * added if np.all(np.isfinite(added)) else nothing
 
     @cached_property
-    def declared(self) -> list[tuple[int, str]]:
+    def parameter_numbers(self) -> list[tuple[int, str]]:
         """Numbers and names of the free parameters that the model declares: no initial states."""
         names = {parameter.name for parameter in self.problem.model.parameters}
         return [(d, name) for d, name in enumerate(self.problem.free_names) if name in names]
@@ -185,7 +185,7 @@ class ResidualContext:
         scale = compute_physical_scale(self.problem, self.theta)
         moved, errors = fit.coefficients[:d] * scale, fit.errors[:d] * scale
         start = np.zeros(d) if before is None else before.coefficients[:d] * scale
-        ends = {number: [float(moved[number])] for number, _ in self.declared}
+        ends = {number: [float(moved[number])] for number, _ in self.parameter_numbers}
         if varies is not None:
             number, *shares = varies
             change = float(fit.coefficients[-1] * scale[number])
@@ -198,7 +198,7 @@ class ResidualContext:
                 float(errors[number]),
                 float(end - start[number]) / stderr,
             )
-            for number, name in self.declared
+            for number, name in self.parameter_numbers
             if (stderr := known[name].stderr)
             for end in ends[number]
         )
@@ -222,7 +222,7 @@ class ResidualContext:
                 float(fit.errors[number] * scale[number]),
                 float(values[number] - self.theta[number]) / stderr,
             )
-            for number, name in self.declared
+            for number, name in self.parameter_numbers
             if (stderr := known[name].stderr)
         )
         return Refitted(fit.criterion, moves)
@@ -260,7 +260,7 @@ class ResidualContext:
         errors = [fit.errors[k * d : (k + 1) * d] * scales[k] for k in range(2)]
         known = {estimate.name: estimate for estimate in self.analysis.estimates}
         moves, changes = [], []
-        for number, name in self.declared:
+        for number, name in self.parameter_numbers:
             stderr = known[name].stderr
             if not stderr:
                 continue
@@ -283,7 +283,7 @@ class ResidualContext:
     @cached_property
     def start_slopes(self) -> list[FloatArray]:
         """Slopes (n,) of the outputs in the start of each state, estimated or not."""
-        declared = {number for number, _ in self.declared}
+        declared = {number for number, _ in self.parameter_numbers}
         columns = self.residual_model.columns
         own = [columns[:, d] for d in range(self.theta.size) if d not in declared]
         own += [np.sum(slopes, axis=1) for slopes in self.fixed_start_slopes]
@@ -441,7 +441,7 @@ class ResidualContext:
         return allowed
 
     @cached_property
-    def _bases(self) -> list[tuple[tuple[Noise, ...] | None, FloatArray, FloatArray]]:
+    def _bases(self) -> list[tuple[tuple[OutputNoise, ...] | None, FloatArray, FloatArray]]:
         """Basis (n, D) of the slopes and residuals (n,), under white and coloured noise."""
         model, bases = self.residual_model, []
         base = model.without

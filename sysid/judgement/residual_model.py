@@ -29,7 +29,7 @@ _RIDGE = 1e-10  # of columns of length 1: only a column that others hold is kept
 _LEAST_VARIANCE = 1e-20  # of the residuals: less is rounding
 
 
-class Noise(NamedTuple):
+class OutputNoise(NamedTuple):
     """Noise of an output: an autoregression (p,), its variance and that of its innovations."""
 
     weights: FloatArray
@@ -62,7 +62,7 @@ class ColumnFit(NamedTuple):
     coefficients : FloatArray, shape (k,)
     errors : FloatArray, shape (k,)
         Their standard errors.
-    noise : tuple of Noise
+    noise : tuple of OutputNoise
         Of each output.
     innovations : FloatArray, shape (n,)
         Of the noise, in its deviations.
@@ -71,7 +71,7 @@ class ColumnFit(NamedTuple):
     criterion: float
     coefficients: FloatArray
     errors: FloatArray
-    noise: tuple[Noise, ...]
+    noise: tuple[OutputNoise, ...]
     innovations: FloatArray
 
     @property
@@ -135,7 +135,7 @@ class ResidualModel:
             innovations,
         )
 
-    def whiten(self, values: FloatArray, noise: Sequence[Noise]) -> FloatArray:
+    def whiten(self, values: FloatArray, noise: Sequence[OutputNoise]) -> FloatArray:
         """Whiten values (n,) or (n, k) by the noise of each output."""
         whitened = np.empty(values.shape)
         for rows, one in zip(self._series, noise, strict=True):
@@ -143,7 +143,7 @@ class ResidualModel:
                 whitened[r] = one.whiten(values[r])
         return whitened
 
-    def _fit_noise(self, series: Sequence[FloatArray]) -> Noise:
+    def _fit_noise(self, series: Sequence[FloatArray]) -> OutputNoise:
         """Fit an autoregression by least squares, its order by Schwarz's criterion."""
         most = self._order
         stacked = np.concatenate(
@@ -167,7 +167,7 @@ class ResidualModel:
             criterion = n * np.log(power) + order * np.log(n)
             if criterion < best:
                 best, weights, least = criterion, found, power
-        return Noise(weights, variance, least)
+        return OutputNoise(weights, variance, least)
 
 
 def _solve(products: FloatArray) -> FloatArray:

@@ -18,11 +18,9 @@ from sysid.kernels.signals.delayed_reads import TimeStep
 from sysid.kernels.signals.signal_readers import SignalReaders
 from sysid.kernels.vectors import DOUBLE, IrValue, KernelLoop, VectorBuilder
 from sysid.language.delays import has_varying_delay
+from sysid.language.time_switches import HALVINGS
 from sysid.language.tree import Expression, PastValue, Symbol
 from sysid.models.model import Model
-
-HALVINGS = 52
-"""Bisections that locate a switch: of a step as many as a number has binary digits."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,9 @@ from sysid.language.tree import Binary, Expression, FunctionCall, Number, walk
 _ORDERINGS = ("<", "<=", ">", ">=")
 _ZERO, _HALF, _ONE = Number(0.0), Number(0.5), Number(1.0)
 
+HALVINGS = 52
+"""Bisections that locate a switch: of a step as many as a number has binary digits."""
+
 
 def list_sides(trees: Iterable[Expression]) -> tuple[Expression, ...]:
     """List the sides of all switches in time of some expressions, each once.

@@ -52,7 +52,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 other = context.simulate(records)
             except SysidError:
                 continue
-            moved = other - context.simulated
+            moved = other - context.simulation
             if np.all(np.isfinite(moved)) and np.any(moved != 0):
                 yield Candidate(
                     change.explanation,
@@ -100,7 +100,7 @@ def propose_loads(context: ResidualContext) -> Iterator[Candidate]:
             for record in context.problem.records
         ]
         with suppress(SysidError):
-            moved = context.simulate(records) - context.simulated
+            moved = context.simulate(records) - context.simulation
             if np.all(np.isfinite(moved)) and moved.any():
                 yield Candidate(
                     "load",

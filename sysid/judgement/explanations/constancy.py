@@ -24,7 +24,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
     share = _centre_times(context)
     clock = context.weigh(context.slope)[:, 0]
     is_lag_a_clock = False
-    for number, name in context.declared:
+    for number, name in context.parameter_numbers:
         column = model.columns[:, number]
         if not column.any() or _are_alike(column, context.weight):
             continue  # an offset of the output: a step or a drift of the sensor
@@ -93,10 +93,10 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
 def _list_signals(context: ResidualContext) -> Iterator[tuple[str, FloatArray]]:
     """List the outputs and inputs (n,) that a parameter may follow, from about -0.5 to 0.5."""
     for name, rows, _ in context.iterate_outputs():
-        values = np.where(rows, context.simulated, 0.0)
-        span = float(np.ptp(context.simulated[rows]))
+        values = np.where(rows, context.simulation, 0.0)
+        span = float(np.ptp(context.simulation[rows]))
         if span > 0:
-            yield name, np.where(rows, (values - np.mean(context.simulated[rows])) / span, 0.0)
+            yield name, np.where(rows, (values - np.mean(context.simulation[rows])) / span, 0.0)
     for channel in context.moving_inputs:
         values = context.read_input(channel.name)
         span = float(np.ptp(values))

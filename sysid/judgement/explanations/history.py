@@ -79,7 +79,7 @@ def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:
         for span in range(_SPANS):
             with suppress(SysidError):
                 other = context.simulate(_change_history(context, name, reach, span))
-                columns.append(other - context.simulated)
+                columns.append(other - context.simulation)
         moved = [column for column in columns if np.all(np.isfinite(column)) and column.any()]
         if moved:
             yield Candidate(

@@ -101,7 +101,7 @@ def _find_variance(
     mean = float(np.mean(squares))
     if not mean > 0:
         return
-    size, slope = context.simulated[rows], np.abs(context.slope[rows])
+    size, slope = context.simulation[rows], np.abs(context.slope[rows])
     causes = {
         f"the size of {name}": np.abs(size - np.mean(size)),
         f"{name} itself": size,

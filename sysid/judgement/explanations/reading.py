@@ -46,7 +46,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 other = context.simulate(records)
             except SysidError:
                 continue
-            moved = other - context.simulated
+            moved = other - context.simulation
             if np.all(np.isfinite(moved)) and moved.any():
                 is_sure = change is _keep and channel.sampling.is_regular
                 setting = f"Use hold: {{{name}: {hold}}}." if is_sure else ""
@@ -73,7 +73,7 @@ def _propose_means(context: ResidualContext) -> Iterator[Candidate]:
             yield Candidate(
                 "mean of a period",
                 "reading",
-                context.weigh(mean - context.simulated),
+                context.weigh(mean - context.simulation),
                 "the output is a mean",
                 f"the output is the mean of the period that {word} at its stamp",
                 "Move the stamps of the output to the middle of the period.",

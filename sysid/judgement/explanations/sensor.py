@@ -30,7 +30,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
 
 
 def _propose_courses(context: ResidualContext, name: str, rows: BoolArray) -> Iterator[Candidate]:
-    times, simulated = context.times, context.simulated
+    times, simulated = context.times, context.simulation
     share = np.where(rows, (times - np.mean(times)) / max(float(np.ptp(times)), 1e-300), 0.0)
     yield Candidate(
         "drift of a sensor",
@@ -71,7 +71,7 @@ def _propose_courses(context: ResidualContext, name: str, rows: BoolArray) -> It
 def _propose_curves(
     context: ResidualContext, name: str, rows: BoolArray, unit: str
 ) -> Iterator[Candidate]:
-    simulated, measured = context.simulated, context.measured
+    simulated, measured = context.simulation, context.measurement
     own = simulated[rows]
     spread = float(np.std(own))
     if not spread > 0:
@@ -116,7 +116,7 @@ def _propose_lines(context: ResidualContext, name: str, rows: BoolArray) -> Iter
     """
     drawn, is_drawn = np.zeros(rows.size), False
     for part in context.parts:
-        measured, simulated = context.measured[part.rows], context.simulated[part.rows]
+        measured, simulated = context.measurement[part.rows], context.simulation[part.rows]
         if part.output != name or measured.size < _LIMIT_SAMPLES:
             continue
         bends = np.abs(np.diff(measured, 2))
@@ -146,7 +146,7 @@ def _propose_old_readings(
     older, is_repeated = np.zeros(rows.size), False
     for part in context.parts:
         if part.output == name:
-            measured, simulated = context.measured[part.rows], context.simulated[part.rows]
+            measured, simulated = context.measurement[part.rows], context.simulation[part.rows]
             equal = np.concatenate([[False], np.diff(measured) == 0])
             is_repeated |= bool(np.mean(equal) > _REPEATED_SHARE) or _count_longest(equal) > 9
             last = np.maximum.accumulate(np.where(equal, 0, np.arange(equal.size)))
@@ -164,7 +164,7 @@ def _propose_old_readings(
         before = np.zeros(rows.size)
         for part in context.parts:
             if part.output == name and part.times.size > samples:
-                values = context.simulated[part.rows]
+                values = context.simulation[part.rows]
                 before[part.rows] = _average_before(values, samples) - values
         if before.any():
             yield Candidate(

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
 from sysid.judgement.residual_context import Candidate, ResidualContext
 
@@ -21,7 +22,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
     for samples in _PARTS:
         filtered = np.zeros(context.times.size)
         for part in context.parts:
-            values = context.simulated[part.rows]
+            values = context.simulation[part.rows]
             filtered[part.rows] = _filter(values, samples) - values
         yield Candidate(
             "one more time constant",
@@ -77,11 +78,16 @@ def _propose_dynamics(
     )
 
 
+@jit_compile
 def _filter(values: FloatArray, samples: float) -> FloatArray:
-    from scipy.signal import lfilter  # imported late: slow to load
-
-    pole = float(np.exp(-1.0 / samples))
-    return np.asarray(lfilter([1.0 - pole], [1.0, -pole], values - values[0]) + values[0])
+    """Filter values (n,) by a time constant of some samples; they rest at their first one."""
+    pole = np.exp(-1.0 / samples)
+    filtered = np.empty(values.size)
+    last = values[0]
+    for i in range(values.size):
+        last = pole * last + (1.0 - pole) * values[i]
+        filtered[i] = last
+    return filtered
 
 
 def _differentiate(context: ResidualContext) -> FloatArray:

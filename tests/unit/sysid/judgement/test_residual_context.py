@@ -91,7 +91,7 @@ def test_missing_samples_are_left_out() -> None:
     context = build_line(shift)
     assert context.times.size == N - 40
     assert not np.isin(STEP * np.arange(50, 90), context.times).any()
-    assert np.all(np.isfinite(context.measured))
+    assert np.all(np.isfinite(context.measurement))
     (moment, _), *_ = find_moments(context)
     assert moment == pytest.approx(200 * STEP, abs=STEP)
 
@@ -110,7 +110,7 @@ def test_each_output_has_its_rows_and_its_name() -> None:
     assert [*rows] == ["y", "z"]
     np.testing.assert_array_equal(rows["y"], ~rows["z"])
     assert rows["y"].sum() == 2 * N
-    assert context.measured[rows["y"]].mean() > context.measured[rows["z"]].mean()
+    assert context.measurement[rows["y"]].mean() > context.measurement[rows["z"]].mean()
     names = [context.name_part(part) for part in context.parts]
     assert names == [
         "y of experiment 1",
@@ -123,10 +123,10 @@ def test_each_output_has_its_rows_and_its_name() -> None:
 def test_the_same_inputs_give_the_same_simulation_and_others_their_response() -> None:
     context = build_line(np.zeros(N))
     same = context.simulate(context.problem.records)
-    np.testing.assert_array_equal(same, context.simulated)
+    np.testing.assert_array_equal(same, context.simulation)
     higher = context.simulate(context.replace_input("u", lambda values: values + 1.0))
     a = context.theta[context.problem.free_names.index("a")]
-    np.testing.assert_allclose(higher - context.simulated, a, rtol=1e-9)
+    np.testing.assert_allclose(higher - context.simulation, a, rtol=1e-9)
     assert len(context.spent) >= 2
     assert context.problem.records[0].inputs[0].values.max() <= 2.0  # the own record is as it was
 
@@ -136,7 +136,7 @@ def compare_moves(shift: FloatArray, pattern: FloatArray) -> None:
     context = build_line(shift)
     model = context.residual_model
     moves = context.compute_moves(model.fit(context.weigh(pattern)))
-    u, y = draw_levels(0), context.measured
+    u, y = draw_levels(0), context.measurement
     before = np.linalg.lstsq(np.column_stack([u, np.ones(N)]), y, rcond=None)[0]
     after = np.linalg.lstsq(np.column_stack([u, np.ones(N), pattern]), y, rcond=None)[0]
     known = {one.name: one for one in context.analysis.estimates}
@@ -207,7 +207,7 @@ def test_the_largest_innovations_are_the_shocks() -> None:
 def test_the_slope_is_that_of_the_simulated_output_within_an_experiment() -> None:
     context = build_context([draw_record(FAST, 1), draw_record(FAST, 2)], "fopdt", FAST.values)
     for part in context.parts:
-        values = context.simulated[part.rows]
+        values = context.simulation[part.rows]
         expected = np.gradient(values, part.times)
         np.testing.assert_allclose(context.slope[part.rows], expected)
 
@@ -215,7 +215,7 @@ def test_the_slope_is_that_of_the_simulated_output_within_an_experiment() -> Non
 def test_parameters_that_lags_depend_on_are_delays_and_starts_are_not_declared() -> None:
     context = build_context([draw_record(FAST, 1)], "fopdt", FAST.values)
     assert context.delays == {"L"}
-    assert [name for _, name in context.declared] == ["K", "T", "L", "y0"]
+    assert [name for _, name in context.parameter_numbers] == ["K", "T", "L", "y0"]
     tied = load_model(
         {
             **load_model("fopdt").document,

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from sysid.core.types import FloatArray
 from sysid.judgement.levels import DEFECT_GAIN
-from sysid.judgement.residual_model import Noise, ResidualModel
+from sysid.judgement.residual_model import OutputNoise, ResidualModel
 from sysid.residuals.series import ResidualPart
 from tests.support.profiles import draw_seeds
 
@@ -84,7 +84,7 @@ def test_in_white_noise_coefficients_and_errors_are_those_of_least_squares() -> 
     np.testing.assert_allclose(fit.errors, errors, rtol=1e-6)
 
 
-def whiten_by_hand(noise: Noise, n: int) -> FloatArray:
+def whiten_by_hand(noise: OutputNoise, n: int) -> FloatArray:
     """Build the matrix (n, n) that whitens a series."""
     order, matrix = noise.weights.size, np.eye(n)
     for row in range(order, n):
@@ -119,7 +119,7 @@ def test_whitening_of_the_true_noise_leaves_white_innovations_of_variance_1(
     weights: tuple[float, ...],
 ) -> None:
     values = draw_noise(20_000, weights, 3)
-    noise = Noise(np.array(weights), float(np.var(values)), 1.0)
+    noise = OutputNoise(np.array(weights), float(np.var(values)), 1.0)
     white = noise.whiten(values)
     assert np.var(white) == pytest.approx(1.0, rel=0.05)
     for lag in (1, 2, 3):
@@ -263,7 +263,7 @@ def test_each_output_has_a_noise_of_its_own_and_experiments_share_it() -> None:
 
 def test_a_series_is_not_filtered_across_the_border_of_an_experiment() -> None:
     model = make_model(np.zeros(2 * N), np.ones((2 * N, 1)), make_parts(N, N))
-    noise = (Noise(np.array([0.9]), 1.0, 0.19),)
+    noise = (OutputNoise(np.array([0.9]), 1.0, 0.19),)
     whitened = model.whiten(np.concatenate([np.full(N, 5.0), np.full(N, -5.0)]), noise)
     np.testing.assert_allclose(whitened[:N], -whitened[N:])
 
