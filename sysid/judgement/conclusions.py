@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 _MOST_REASONS = 2  # of an estimate, and in a verdict
 
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
-_OF_NOISE = ("outliers", "unequal variance", "coloured noise")
 _RANKS: tuple[EstimateStatus, ...] = (
     "identified",
     "dependent",
@@ -44,7 +43,7 @@ def order_findings(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 def _find_group(finding: Finding) -> int:
     is_clear = finding.gain is not None and finding.gain > DEFECT_GAIN
-    if is_clear and finding.explanation not in _OF_NOISE:
+    if is_clear and not finding.is_of_noise:
         return 0
     return 1 + _SEVERITIES.index(finding.severity)
 

@@ -286,13 +286,14 @@ def select_explanations(
 
     Each of them was compared with the model alone, so they compete. Those with strong evidence
     against them, beside the likeliest one, are left out. What was found beside the likeliest one
-    stays with it.
+    stays with it. Explanations of the noise compete with none of them, and always stay.
     """
     names = {one.explanation for one in explained}
     refitted = [one for one in refitted if one.explanation not in names or not one.parameters]
-    first = max((one.gain or 0.0 for one in explained), default=0.0)
+    of_noise = [one for one in explained if one.is_of_noise]
+    first = max((one.gain or 0.0 for one in explained if not one.is_of_noise), default=0.0)
     other = max((one.gain or 0.0 for one in refitted), default=0.0)
     kept = [one for one in refitted if one.gain is None or (one.gain or 0.0) > first - STRONG_ODDS]
     if other - first > STRONG_ODDS:
-        return tuple(kept)
+        return (*of_noise, *kept)
     return (*explained, *kept)

@@ -181,6 +181,17 @@ def test_what_is_compared_with_nothing_is_kept_always() -> None:
     assert select_explanations((), (order,)) == (order,)
 
 
+@pytest.mark.parametrize("explanation", ["outliers", "unequal variance"])
+@pytest.mark.parametrize("gain", [20.0, 300.0])
+def test_what_explains_the_noise_hides_no_other_explanation(explanation: str, gain: float) -> None:
+    of_noise, order = make_finding(explanation, gain), make_finding("order", 50.0, "L")
+    assert select_explanations((of_noise,), (order,)) == (of_noise, order)
+    drift = make_finding("drift", 20.0, "T")
+    assert select_explanations((drift, of_noise), (order,)) == (of_noise, order)
+    start = make_finding("start", -3.0, "L")
+    assert select_explanations((of_noise,), (start,)) == (of_noise, start)
+
+
 def test_outliers_hide_no_change_and_no_change_hides_them() -> None:
     u = draw_levels(1)
     y = FAST.respond(hold(u))[::FINE] + 0.3 * LATE + NOISE * draw_noise(1)
