@@ -60,9 +60,10 @@ class _Scored(NamedTuple):
 
 
 class Explained(NamedTuple):
-    """Findings about residuals; `is_done`: whether they were looked for.
+    """Findings about residuals; `is_done`: whether all explanations were looked for.
 
-    `is_doubtful`: something has strong odds against noise alone, but not those of a defect.
+    `is_doubtful`: something has strong odds against noise alone, but not those of a defect. Or
+    not all were looked for.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -79,10 +80,10 @@ def explain_residuals(context: ResidualContext) -> Explained:
     """Explain the residuals of an estimate by the likeliest explanations, the largest gain first.
 
     The likeliest one is taken, then the likeliest beside it, as long as one gains clearly
-    (stepwise by Schwarz's criterion).
+    (stepwise by Schwarz's criterion). If no simulations are left for some of them, it is not done.
     """
-    if not _is_possible(context):
-        return Explained()
+    if not (_is_possible(context) and np.all(np.isfinite(context.simulated))):
+        return Explained(is_doubtful=context.simulations.is_cut_short)
     base = context.residual_model.without
     before: ColumnFit | None = None
     taken, counted = np.zeros((context.times.size, 0)), 0
@@ -115,7 +116,8 @@ def explain_residuals(context: ResidualContext) -> Explained:
     findings += find_noise(context, base)
     if not findings:
         findings += find_disagreement_of_frequencies(context)
-    return Explained(tuple(findings), True, is_doubtful)
+    is_cut_short = context.simulations.is_cut_short
+    return Explained(tuple(findings), not is_cut_short, is_doubtful or is_cut_short)
 
 
 def _is_possible(context: ResidualContext) -> bool:
