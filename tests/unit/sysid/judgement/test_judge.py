@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from sysid.core.settings import Loss
+from sysid.judgement import judge
 from sysid.judgement.conclusions import order_findings
 from sysid.judgement.judge import Explained, explain_residuals, select_explanations
 from sysid.judgement.levels import DEFECT_GAIN, STRONG_ODDS
-from sysid.judgement.residual_context import ResidualContext, Simulations
+from sysid.judgement.residual_context import Candidate, ResidualContext, Simulations
 from sysid.models.parse import parse_model
 from sysid.results.findings import Finding, note
 from sysid.uncertainty.analysis import analyse_estimate
@@ -208,6 +209,30 @@ def test_what_explains_the_noise_hides_no_other_explanation(explanation: str, ga
     assert select_explanations((drift, of_noise), (order,)) == (of_noise, order)
     start = make_finding("start", -3.0, "L")
     assert select_explanations((of_noise,), (start,)) == (of_noise, start)
+
+
+@pytest.mark.parametrize(("size", "name"), [(1.0, "integration step"), (10.0, "another reading")])
+def test_known_errors_of_the_integration_come_before_what_looks_like_them(
+    monkeypatch: pytest.MonkeyPatch, size: float, name: str
+) -> None:
+    noise, error = NOISE * draw_noise(1), 0.03 * np.sin(TIMES)
+
+    def propose(context: ResidualContext) -> list[Candidate]:
+        both = {"another reading": 2.0 * error, "integration step": error}
+        families = {"integration step": "numerics", "another reading": "reading"}
+        return [
+            Candidate(one, families[one], context.weigh(column), one, one)
+            for one, column in both.items()
+        ]
+
+    monkeypatch.setattr(judge, "_PROPOSERS", (propose,))
+    monkeypatch.setattr(judge, "_COSTLY_PROPOSERS", ())
+    u = draw_levels(1)
+    y = 2.0 * u + 1.0 + noise + size * error
+    context = build_context([make_record(u, y)], parse_model(LINE), {"a": 2.0, "b": 1.0})
+    (found,) = explain_residuals(context).findings
+    assert found.explanation == name
+    assert ("As likely" in found.text) == (name == "another reading")
 
 
 def test_outliers_hide_no_change_and_no_change_hides_them() -> None:
