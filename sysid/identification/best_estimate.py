@@ -33,8 +33,12 @@ from sysid.judgement.integration_step import (
     halve_step,
     mark_changing,
 )
-from sysid.judgement.judge import MOST_SIMULATIONS, Explained, explain_residuals
-from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
+from sysid.judgement.judge import Explained, explain_residuals
+from sysid.judgement.residual_context import (
+    ResidualContext,
+    Simulations,
+    find_delay_parameters,
+)
 from sysid.judgement.starts import (
     FittedStart,
     StartComparison,
@@ -400,14 +404,17 @@ class _EstimateSearch:
         return ""
 
     def explain(self, *, explains: bool) -> Explained:
-        """Explain the residuals of least squares, if asked for or if their colour needs it."""
-        left = self._budget.count_left(self._reserved)
-        has_time = not self._deadline.is_past_grace() and (left is None or left >= MOST_SIMULATIONS)
-        if not has_time or not (explains or self._may_be_ar1()):
+        """Explain the residuals of least squares, if asked for or if their colour needs it.
+
+        Explanations that budget and time do not allow are left out.
+        """
+        if not (explains or self._may_be_ar1()):
             return Explained()
-        context = ResidualContext(self.problem, self.theta, self.analysis)
+        left = self._budget.count_left(self._reserved)
+        simulations = Simulations(left, self._deadline.is_past_grace)
+        context = ResidualContext(self.problem, self.theta, self.analysis, simulations)
         explained = explain_residuals(context)
-        self._budget.spend(len(context.spent))
+        self._budget.spend(simulations.spent)
         return explained
 
     def apply_noise_model(self, explained: Explained, *, is_settled: bool) -> GeneralisedEstimate:

@@ -29,7 +29,6 @@ _MOST_REASONS = 2  # of an estimate, and in a verdict
 
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
 _OF_RECORD = ("constant output", "constant input")  # then nothing else says anything
-_OF_NOISE = ("outliers", "unequal variance", "coloured noise")
 _RANKS: tuple[EstimateStatus, ...] = (
     "identified",
     "dependent",
@@ -55,7 +54,7 @@ def _find_group(finding: Finding) -> int:
     if finding.explanation in _OF_RECORD:
         return -1
     is_clear = finding.gain is not None and finding.gain > DEFECT_GAIN
-    if is_clear and finding.explanation not in _OF_NOISE:
+    if is_clear and not finding.is_of_noise:
         return 0
     return 1 + _SEVERITIES.index(finding.severity)
 

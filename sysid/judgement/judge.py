@@ -42,9 +42,6 @@ _PROPOSERS = (
 )
 _COSTLY_PROPOSERS = (actuator.propose, actuator.propose_loads)
 """Each of their explanations takes a simulation: only if the residuals depend on anything."""
-MOST_SIMULATIONS = 500
-"""Of all explanations: a column takes one, a full fit some dozens."""
-
 _LIKELY = 0.01  # of a likelihood ratio: with some forty candidates, of which many are alike
 _BY_ORDER = ("one more time constant", "filter of a sensor")  # another order is the full fit
 _MOST_FINDINGS = 3  # that are found beside each other
@@ -62,9 +59,10 @@ class _Scored(NamedTuple):
 
 
 class Explained(NamedTuple):
-    """Findings about residuals; `is_done`: whether they were looked for.
+    """Findings about residuals; `is_done`: whether all explanations were looked for.
 
-    `is_doubtful`: something has strong odds against noise alone, but not those of a defect.
+    `is_doubtful`: something has strong odds against noise alone, but not those of a defect. Or
+    not all were looked for.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -81,10 +79,11 @@ def explain_residuals(context: ResidualContext) -> Explained:
     """Explain the residuals of an estimate by the likeliest explanations, the largest gain first.
 
     The likeliest one is taken, then the likeliest beside it, as long as one gains clearly
-    (stepwise by Schwarz's criterion).
+    (stepwise by Schwarz's criterion). If no simulations are left for some explanations, it is not
+    done.
     """
-    if not _is_possible(context):
-        return Explained()
+    if not (_is_possible(context) and np.all(np.isfinite(context.simulation))):
+        return Explained(is_doubtful=context.simulations.is_cut_short)
     base = context.residual_model.without
     before: ColumnFit | None = None
     taken, counted = np.zeros((context.times.size, 0)), 0
@@ -117,7 +116,8 @@ def explain_residuals(context: ResidualContext) -> Explained:
     findings += find_noise(context, base)
     if not findings:
         findings += find_disagreement_of_frequencies(context)
-    return Explained(tuple(findings), True, is_doubtful)
+    is_cut_short = context.simulations.is_cut_short
+    return Explained(tuple(findings), not is_cut_short, is_doubtful or is_cut_short)
 
 
 def _is_possible(context: ResidualContext) -> bool:
@@ -292,14 +292,16 @@ def select_explanations(
     Each of them was compared with the model alone, so they compete. Those with strong evidence
     against them, beside the likeliest one, are left out. What was found beside the likeliest one
     stays with it. Another order that was fitted in full takes the place of its columns.
+    stays with it. Explanations of the noise compete with none of them, and always stay.
     """
     if any(one.explanation == "order" and (one.gain or 0.0) > DEFECT_GAIN for one in refitted):
         explained = [one for one in explained if one.explanation not in _BY_ORDER]
     names = {one.explanation for one in explained}
     refitted = [one for one in refitted if one.explanation not in names or not one.parameters]
-    first = max((one.gain or 0.0 for one in explained), default=0.0)
+    of_noise = [one for one in explained if one.is_of_noise]
+    first = max((one.gain or 0.0 for one in explained if not one.is_of_noise), default=0.0)
     other = max((one.gain or 0.0 for one in refitted), default=0.0)
     kept = [one for one in refitted if one.gain is None or (one.gain or 0.0) > first - STRONG_ODDS]
     if other - first > STRONG_ODDS:
-        return tuple(kept)
+        return (*of_noise, *kept)
     return (*explained, *kept)

@@ -141,7 +141,7 @@ def compare_orders(
     if preferred is not None and preferred != own:
         context = contexts[preferred]
         comparison = _judge_fit(comparison, preferred, context)
-        spent += len(context.spent)
+        spent += context.simulations.spent
     return comparison, spent
 
 
@@ -175,7 +175,6 @@ def find_other_orders(
     if comparison.preferred_model is None and not moved:
         return
     listed = ", ".join(_write_delay(comparison, fit) for fit in (own, *others))
-    cure = "Give your model as many time constants, or use" if model != own.model else "Use"
     if comparison.preferred_model is None:
         names = join_names([fit.model for fit in comparison.open_fits])
         brief = f"the data do not tell {names} apart"

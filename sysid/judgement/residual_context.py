@@ -31,6 +31,8 @@ _AFTER = 0.01  # of a period: a held input has jumped then
 _MOST_STATES = 8  # whose starts are looked at
 _FINER = 4  # times as many integration steps
 _SHOCKS = 3  # innovations that are looked at
+_START_SIMULATIONS, _MOST_START_SIMULATIONS = 3, 13  # of the slopes in a start
+_FULL_FIT = 20  # simulations of a full fit and its slopes, for each parameter and one
 _OWN_SHARE = 1e-6  # of a column that no parameter explains: less says nothing
 
 
@@ -76,6 +78,34 @@ class Candidate:
     is_added: bool = False
 
 
+@dataclass(eq=False)
+class Simulations:
+    """Simulations that explanations take.
+
+    Attributes
+    ----------
+    most : int or None
+        What they may take; None: no limit.
+    is_late : callable
+        Whether the time of the run is over.
+    spent : int
+    is_cut_short : bool
+        Whether some were refused.
+    """
+
+    most: int | None = None
+    is_late: Callable[[], bool] = lambda: False
+    spent: int = 0
+    is_cut_short: bool = False
+
+    def allow(self, count: int) -> bool:
+        """Return whether so many more are allowed."""
+        is_short = self.most is not None and self.spent + count > self.most
+        is_refused = is_short or self.is_late()
+        self.is_cut_short |= is_refused
+        return not is_refused
+
+
 @dataclass(frozen=True, eq=False)
 class ResidualContext:
     """Residuals and sensitivities of an estimate by squares, and simulations with other inputs.
@@ -86,12 +116,14 @@ class ResidualContext:
     theta : FloatArray, shape (D,)
     analysis : Analysis
         Of squares, not whitened.
+    simulations : Simulations
+        What is not allowed is not simulated: such values are ``nan``.
     """
 
     problem: Problem
     theta: FloatArray
     analysis: Analysis
-    spent: list[int] = field(default_factory=list)
+    simulations: Simulations = field(default_factory=Simulations)
 
     @cached_property
     def parts(self) -> list[ResidualPart]:
@@ -205,12 +237,14 @@ class ResidualContext:
 
     def refit(self, records: Sequence[Record]) -> "Refitted | None":
         """Fit the model again to other records; None if that fails."""
+        if not self.simulations.allow(_FULL_FIT * (self.theta.size + 1)):
+            return None
         problem = self.problem.rebuild(records=records, weights=self.problem.output_weights)
         (end,) = refine_candidates(problem, [self.theta], _REFIT_STEPS * (self.theta.size + 1))
         if end is None:
             return None
         sensitivities = compute_sensitivities(problem, end.theta)
-        self.spent.extend([1] * (end.evaluations + sensitivities.evaluations))
+        self.simulations.spent += end.evaluations + sensitivities.evaluations
         fit = ResidualModel(-sensitivities.residuals, sensitivities.columns, self.parts).without
         scale = compute_physical_scale(problem, end.theta)
         values = end.theta + fit.coefficients * scale
@@ -237,6 +271,8 @@ class ResidualContext:
         d, n = self.theta.size, self.times.size
         if len(self.problem.records) > 1 or min(is_late.sum(), (~is_late).sum()) < 4 * d:
             return None
+        if not self.simulations.allow(2 * _FULL_FIT * (d + 1)):
+            return None
         points, columns, residuals = [], [], np.zeros(n)
         for is_part in (~is_late, is_late):
             problem = self._leave_out(~is_part)
@@ -244,7 +280,7 @@ class ResidualContext:
             if end is None:
                 return None
             slopes = compute_sensitivities(self.problem, end.theta)
-            self.spent.extend([1] * (end.evaluations + slopes.evaluations))
+            self.simulations.spent += end.evaluations + slopes.evaluations
             residuals[is_part] = -slopes.residuals[is_part]
             columns.append(np.where(is_part[:, None], slopes.columns, 0.0))
             points.append(end.theta)
@@ -300,7 +336,10 @@ class ResidualContext:
     def simulate(
         self, records: Sequence[Record] | None = None, model: Model | None = None
     ) -> FloatArray:
-        """Simulate the scored values (n,) with other inputs or another model."""
+        """Simulate the scored values (n,) with other inputs or another model.
+
+        They are ``nan`` if no more simulations are allowed.
+        """
         weights = self.problem.output_weights
         return self._predict(self.problem.rebuild(records=records, model=model, weights=weights))
 
@@ -335,8 +374,10 @@ class ResidualContext:
         states = list_assumed_starts(self.problem)
         if self.problem.prediction != "simulation" or len(states) > _MOST_STATES:
             return []
+        if not self.simulations.allow(_MOST_START_SIMULATIONS * len(states)):
+            return []
         noise = float(np.sqrt(np.mean(np.square(self.residual_model.residuals))))
-        self.spent.extend([1] * 3 * len(states))
+        self.simulations.spent += _START_SIMULATIONS * len(states)
         return [compute_start_slopes(self.problem, self.theta, one, noise) for one in states]
 
     @cached_property
@@ -456,7 +497,9 @@ class ResidualContext:
         return bases
 
     def _predict(self, problem: Problem) -> FloatArray:
-        self.spent.append(1)
+        if not self.simulations.allow(1):
+            return np.full(self.times.size, np.nan)
+        self.simulations.spent += 1
         values = problem.predict(self.theta[None])[0][problem.scored_rows]
         return np.asarray(values)
 

@@ -23,7 +23,8 @@ from sysid.core.types import FloatArray
 from sysid.residuals.series import ResidualPart
 
 _MOST_ORDER = 6  # of the autoregression of an output's noise
-_SAMPLES_PER_ORDER = 20  # at least, of a series
+_SAMPLES_PER_ORDER = 20  # at least, of an output
+_LENGTH_PER_ORDER = 2  # samples at least, of a series that tells of the noise
 _ROUNDS = 2  # of generalised least squares and noise model, in turn
 _RIDGE = 1e-10  # of columns of length 1: only a column that others hold is kept from dividing by 0
 _LEAST_VARIANCE = 1e-20  # of the residuals: less is rounding
@@ -41,7 +42,7 @@ class OutputNoise(NamedTuple):
 
         The first p keep their correlation, and their variance is that of the noise.
         """
-        first = self.weights.size
+        first = min(self.weights.size, values.shape[0])
         filtered = values / np.sqrt(self.innovation_variance)
         if first:
             for lag, weight in enumerate(self.weights.tolist(), 1):
@@ -93,8 +94,6 @@ class ResidualModel:
         self.residuals, self.columns = residuals, columns
         outputs = dict.fromkeys(part.output for part in parts)
         self._series = [[p.rows for p in parts if p.output == name] for name in outputs]
-        shortest = min(part.times.size for part in parts)
-        self._order = max(min(_MOST_ORDER, shortest // _SAMPLES_PER_ORDER), 0)
         self._least = _LEAST_VARIANCE * max(float(np.mean(np.square(residuals))), 1e-300)
 
     @cached_property
@@ -120,7 +119,7 @@ class ResidualModel:
         n, twice = innovations.size, 0.0
         for rows, one in zip(self._series, noise, strict=True):
             own = np.concatenate([innovations[r] for r in rows])
-            first = one.weights.size * len(rows)
+            first = sum(min(one.weights.size, r.stop - r.start) for r in rows)
             twice += own.size * np.log(max(float(np.mean(np.square(own))), _LEAST_VARIANCE))
             twice += (own.size - first) * np.log(one.innovation_variance)
             twice += first * np.log(one.variance)
@@ -144,12 +143,16 @@ class ResidualModel:
         return whitened
 
     def _fit_noise(self, series: Sequence[FloatArray]) -> OutputNoise:
-        """Fit an autoregression by least squares, its order by Schwarz's criterion."""
-        most = self._order
+        """Fit an autoregression by least squares, its order by Schwarz's criterion.
+
+        Series that are too short for its largest order tell nothing of it, and do not limit it.
+        """
+        most = _find_most_order([values.size for values in series])
         stacked = np.concatenate(
             [
                 np.column_stack([values[most - lag : values.size - lag] for lag in range(most + 1)])
                 for values in series
+                if values.size >= _LENGTH_PER_ORDER * most
             ]
         )
         n = stacked.shape[0]
@@ -168,6 +171,15 @@ class ResidualModel:
             if criterion < best:
                 best, weights, least = criterion, found, power
         return OutputNoise(weights, variance, least)
+
+
+def _find_most_order(sizes: Sequence[int]) -> int:
+    """Find the largest order of the noise that series of such sizes tell."""
+    for order in range(_MOST_ORDER, 0, -1):
+        told = sum(size for size in sizes if size >= _LENGTH_PER_ORDER * order)
+        if told >= _SAMPLES_PER_ORDER * order:
+            return order
+    return 0
 
 
 def _solve(products: FloatArray) -> FloatArray:

@@ -33,6 +33,8 @@ Family = Literal[
     "numerics",
 ]
 
+_OF_NOISE = ("outliers", "unequal variance", "coloured noise")
+
 
 @dataclass(frozen=True, slots=True)
 class Move:
@@ -104,6 +106,11 @@ class Finding:
     def sentences(self) -> str:
         """The text with the advice."""
         return f"{self.text} {self.advice}".rstrip()
+
+    @property
+    def is_of_noise(self) -> bool:
+        """Whether it explains the noise, beside whatever explains the rest."""
+        return self.explanation in _OF_NOISE
 
 
 def note(explanation: str, family: Family, text: str) -> Finding:

@@ -81,7 +81,13 @@ def _propose_means(context: ResidualContext) -> Iterator[Candidate]:
 
 
 def _simulate_means(context: ResidualContext, side: float) -> FloatArray:
-    """Simulate the means (n,) of the periods to one side of each scored sample."""
+    """Simulate the means (n,) of the periods to one side of each scored sample.
+
+    They are ``nan`` if no more simulations are allowed.
+    """
+    if not context.simulations.allow(1):
+        return np.full(context.times.size, np.nan)
+    context.simulations.spent += 1
     problem, records = context.problem, []
     for record in problem.records:
         outputs = []

@@ -9,7 +9,7 @@ from sysid.core.settings import Loss
 from sysid.judgement.conclusions import order_findings
 from sysid.judgement.judge import Explained, explain_residuals, select_explanations
 from sysid.judgement.levels import DEFECT_GAIN, STRONG_ODDS
-from sysid.judgement.residual_context import ResidualContext
+from sysid.judgement.residual_context import ResidualContext, Simulations
 from sysid.models.parse import parse_model
 from sysid.results.findings import Finding, note
 from sysid.uncertainty.analysis import analyse_estimate
@@ -105,7 +105,25 @@ def test_more_of_a_defect_gains_more() -> None:
 def test_simulations_are_counted_and_few() -> None:
     context = build_context([draw_record(FAST, 1)], "fopdt", FAST.values)
     explain_residuals(context)
-    assert 10 < len(context.spent) < 200
+    assert 10 < context.simulations.spent < 200
+
+
+@pytest.mark.parametrize("most", [0, 1, 5, 20])
+def test_no_more_simulations_are_taken_than_are_allowed(most: int) -> None:
+    whole = build_context([draw_record(FAST, 1, pole=0.8)], "fopdt", FAST.values)
+    limited = replace(whole, simulations=Simulations(most))
+    explained = explain_residuals(limited)
+    assert limited.simulations.spent <= most
+    assert not explained.is_done
+    assert not explained.is_noise
+    assert explain_residuals(whole).is_done
+
+
+def test_nothing_is_simulated_after_the_time_limit() -> None:
+    whole = build_context([draw_record(FAST, 1, pole=0.8)], "fopdt", FAST.values)
+    late = replace(whole, simulations=Simulations(is_late=lambda: True))
+    assert not explain_residuals(late).is_done
+    assert late.simulations.spent == 0
 
 
 def test_a_repeated_judgement_is_the_same() -> None:
@@ -179,6 +197,17 @@ def test_what_is_compared_with_nothing_is_kept_always() -> None:
     assert select_explanations((), (remark,)) == (remark,)
     order = make_finding("order", 8.0, "L")
     assert select_explanations((), (order,)) == (order,)
+
+
+@pytest.mark.parametrize("explanation", ["outliers", "unequal variance"])
+@pytest.mark.parametrize("gain", [20.0, 300.0])
+def test_what_explains_the_noise_hides_no_other_explanation(explanation: str, gain: float) -> None:
+    of_noise, order = make_finding(explanation, gain), make_finding("order", 50.0, "L")
+    assert select_explanations((of_noise,), (order,)) == (of_noise, order)
+    drift = make_finding("drift", 20.0, "T")
+    assert select_explanations((drift, of_noise), (order,)) == (of_noise, order)
+    start = make_finding("start", -3.0, "L")
+    assert select_explanations((of_noise,), (start,)) == (of_noise, start)
 
 
 def test_outliers_hide_no_change_and_no_change_hides_them() -> None:

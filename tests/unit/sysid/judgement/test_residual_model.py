@@ -268,8 +268,10 @@ def test_a_series_is_not_filtered_across_the_border_of_an_experiment() -> None:
     np.testing.assert_allclose(whitened[:N], -whitened[N:])
 
 
-def test_short_series_have_white_noise() -> None:
-    model = make_model(draw_noise(38, (0.9,), 1), np.ones((38, 1)), make_parts(19, 19))
+@pytest.mark.parametrize("sizes", [(19,), (10, 9), (1,) * 40])
+def test_few_samples_have_white_noise(sizes: tuple[int, ...]) -> None:
+    n = sum(sizes)
+    model = make_model(draw_noise(n, (0.9,), 1), np.ones((n, 1)), make_parts(*sizes))
     assert not model.without.is_coloured
 
 
@@ -282,3 +284,15 @@ def test_a_repeated_fit_is_the_same_and_changes_nothing() -> None:
     np.testing.assert_array_equal(first.coefficients, second.coefficients)
     np.testing.assert_array_equal(model.residuals, residuals)
     np.testing.assert_array_equal(model.columns, slopes)
+
+
+@pytest.mark.parametrize("sizes", [(300, 15), (300, 3, 1), (40,) * 10, (10,) * 40])
+def test_short_series_do_not_hide_the_colour_of_an_output(sizes: tuple[int, ...]) -> None:
+    series = [draw_noise(size, (0.9,), seed) for seed, size in enumerate(sizes)]
+    parts = make_parts(*sizes)
+    late = np.concatenate([np.arange(size) > size // 2 for size in sizes])
+    residuals = np.concatenate(series)
+    model = make_model(residuals, np.ones((residuals.size, 1)), parts)
+    (noise,) = model.without.noise
+    assert noise.weights[0] == pytest.approx(0.9, abs=0.25)
+    assert compute_gain(model, late[:, None].astype(np.float64), 1) < DEFECT_GAIN
