@@ -8,7 +8,7 @@ import numpy as np
 from sysid.core.text import join_names
 from sysid.core.units import format_unit
 from sysid.judgement.yardstick import Yardstick
-from sysid.results.findings import Finding
+from sysid.results.findings import Finding, Severity
 from sysid.simulation.fit_metrics import ChannelMetrics, Metrics
 from sysid.simulation.problem import Problem
 
@@ -88,7 +88,7 @@ def find_constant_outputs(problem: Problem) -> Iterator[Finding]:
         if np.ptp(values) == 0.0:
             still.append((output.name, values, format_unit(output.unit)))
     for name, values, unit in still:
-        severity = "serious" if len(still) == len(problem.model.outputs) else "caution"
+        severity: Severity = "serious" if len(still) == len(problem.model.outputs) else "caution"
         yield Finding(
             "constant output",
             "record",

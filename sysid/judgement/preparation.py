@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from sysid.judgement.residual_context import list_delayed_values
+from sysid.kernels.signals.past_reads import list_delayed_values
 from sysid.models.unit_checks import (
     list_mixed_unit_warnings,
     list_time_unit_warnings,

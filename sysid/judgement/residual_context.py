@@ -11,6 +11,7 @@ from sysid.core.errors import SysidError
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.core.units import format_unit
+from sysid.data.holds import Hold
 from sysid.data.interpolation import interpolate_channel
 from sysid.data.records import Channel, Record
 from sysid.judgement.residual_model import ColumnFit, OutputNoise, ResidualModel
@@ -349,19 +350,16 @@ class ResidualContext:
         return self._predict(self.problem.rebuild(records=records, model=model, weights=weights))
 
     def replace_input(
-        self, name: str, change: Callable[[FloatArray], FloatArray], **fields: object
+        self, name: str, change: Callable[[FloatArray], FloatArray], hold: Hold | None = None
     ) -> list[Record]:
-        """Replace the values (N,) of an input in all records; other fields of it too."""
+        """Replace the values (N,) of an input in all records, and its hold if one is given."""
         records = []
         for record in self.problem.records:
             inputs = tuple(
                 replace(
                     channel,
-                    **{
-                        "values": change(channel.values),
-                        "hold": channel.effective_hold,
-                        **fields,
-                    },
+                    values=change(channel.values),
+                    hold=channel.effective_hold if hold is None else hold,
                 )
                 if channel.name == name
                 else channel
@@ -453,7 +451,7 @@ class ResidualContext:
     def find_shocks(self) -> list[int]:
         """Find the largest innovations, as numbers of samples."""
         sizes = np.abs(self.residual_model.without.innovations)
-        return np.argsort(-sizes)[:_SHOCKS].tolist()
+        return [int(row) for row in np.argsort(-sizes)[:_SHOCKS]]
 
     def _describe_moment(self, position: int, moment: float) -> str:
         experiment = int(self._experiments[self._order[position]])

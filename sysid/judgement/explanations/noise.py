@@ -165,8 +165,12 @@ def _weigh(context: ResidualContext, fit: ColumnFit, weights: FloatArray) -> tup
     columns = model.whiten(model.columns, fit.noise)
     target = model.whiten(model.residuals, fit.noise)
     root = np.sqrt(weights)
-    plain = np.linalg.lstsq(columns, target, rcond=1e-10)[0]
-    moved = np.linalg.lstsq(columns * root[:, None], target * root, rcond=1e-10)[0]
+    plain, moved = (
+        np.asarray(
+            np.linalg.lstsq(columns * one[:, None], target * one, rcond=1e-10)[0], np.float64
+        )
+        for one in (np.ones(root.size), root)
+    )
     still = fit._replace(coefficients=plain, errors=np.zeros(plain.size))
     return context.compute_moves(still._replace(coefficients=moved), still)
 
@@ -176,4 +180,4 @@ def _are_neighbours(values: FloatArray) -> bool:
     limit = _LARGE * 1.4826 * float(np.median(np.abs(values)))
     signs = np.where(np.abs(values) > limit, np.sign(values), 0.0)
     pairs = np.count_nonzero(signs[1:] * signs[:-1] > 0)
-    return bool(pairs > _MOST_PAIRS * max(np.count_nonzero(signs), 1))
+    return bool(pairs > _MOST_PAIRS * max(int(np.count_nonzero(signs)), 1))

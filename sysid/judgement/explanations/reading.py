@@ -5,13 +5,14 @@ stamp. An output is a value at its stamp, or the mean of such a period. Each is 
 reading) - ŷ.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
+from sysid.data.holds import Hold
 from sysid.judgement.residual_context import Candidate, ResidualContext
 from sysid.kernels.signals.past_reads import is_difference
 
@@ -24,7 +25,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
         return  # predictions know the noise of their samples
     for channel in context.moving_inputs:
         name = channel.name
-        others = {
+        others: dict[str, tuple[Hold, Callable[[FloatArray], FloatArray], str]] = {
             "held": ("zero", _keep, "is held between its samples"),
             "as straight lines": ("first", _keep, "runs in straight lines between its samples"),
             "as means that end at their stamps": (

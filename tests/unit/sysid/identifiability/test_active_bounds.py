@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sysid.diagnosis.holding_bounds import find_cause_in_bounds
 
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
@@ -15,6 +14,7 @@ from sysid.identifiability.active_bounds import (
     rank_active_bounds,
 )
 from sysid.identifiability.bound_limits import find_widest_bounds
+from sysid.judgement.holding_bounds import find_cause_in_bounds
 from sysid.models.model import Model
 from sysid.models.parameters import Parameter
 from sysid.models.parse import parse_model
