@@ -168,10 +168,15 @@ class ResidualContext:
 
         Errors of the integration are taken out first. They are the program's, and no defect: an
         input that jumps inside a step leaves one, and under coloured noise even a small one shows.
+        A record that was simulated with the same steps has none: then they stay, by the criterion.
         """
         assert self.analysis.residuals_and_sensitivities is not None
         error, columns = self.analysis.residuals_and_sensitivities
-        return ResidualModel(-error - self._integration_error, columns, self.parts)
+        plain = ResidualModel(-error, columns, self.parts)
+        if not self._integration_error.any():
+            return plain
+        exact = ResidualModel(-error - self._integration_error, columns, self.parts)
+        return min(exact, plain, key=lambda model: model.without.criterion)
 
     @cached_property
     def _integration_error(self) -> FloatArray:

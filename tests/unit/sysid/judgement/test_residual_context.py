@@ -224,3 +224,17 @@ def test_parameters_that_lags_depend_on_are_delays_and_starts_are_not_declared()
     )
     problem = build_context([draw_record(FAST, 1)], tied, {**FAST.values, "V": 1.0}).problem
     assert find_delay_parameters(problem) == {"L", "V"}
+
+
+@pytest.mark.parametrize("has_errors", [True, False])
+def test_errors_of_the_integration_are_taken_out_of_records_that_have_them(
+    has_errors: bool,
+) -> None:
+    """One that the model's own steps made has none."""
+    added = 0.2 * NOISE * draw_levels(9)
+    context = build_line(added if has_errors else np.zeros(N))
+    vars(context)["_integration_error"] = context.weigh(added)[:, 0]
+    assert context.analysis.residuals_and_sensitivities is not None
+    rest = -context.analysis.residuals_and_sensitivities[0]
+    wanted = rest - context.weigh(added)[:, 0] if has_errors else rest
+    np.testing.assert_array_equal(context.residual_model.residuals, wanted)
