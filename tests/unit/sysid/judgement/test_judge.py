@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sysid.core.settings import Loss
+from sysid.data.records import Channel, Record
 from sysid.judgement import judge
 from sysid.judgement.conclusions import order_findings
 from sysid.judgement.judge import Explained, explain_residuals, select_explanations
@@ -19,6 +20,7 @@ from tests.support.library.judged_records import (
     FAST,
     FINE,
     NOISE,
+    STEP,
     N,
     build_context,
     draw_levels,
@@ -209,6 +211,37 @@ def test_what_explains_the_noise_hides_no_other_explanation(explanation: str, ga
     assert select_explanations((drift, of_noise), (order,)) == (of_noise, order)
     start = make_finding("start", -3.0, "L")
     assert select_explanations((of_noise,), (start,)) == (of_noise, start)
+
+
+def test_a_short_record_with_many_inputs_has_no_dynamics_in_its_noise() -> None:
+    names, n = [f"u{i}" for i in range(5)], 52
+    model = parse_model(
+        {
+            "name": "sum",
+            "form": "differential",
+            "inputs": dict.fromkeys(names, "1"),
+            "states": {"x": "1"},
+            "parameters": {f"a{i}": {"lower": -10, "upper": 10, "unit": "1"} for i in range(5)},
+            "equations": {"x": "-x"},
+            "outputs": {"y": "x + " + " + ".join(f"a{i}*u{i}" for i in range(5))},
+            "initial": {"x": 0},
+            "solver": {"method": "rk4", "step": "sample", "substeps": 1},
+        }
+    )
+    found = list[str]()
+    for seed in range(12):
+        random = np.random.default_rng(seed)
+        times, inputs = STEP * np.arange(n), random.standard_normal((5, n))
+        y = np.sum(inputs, axis=0) + NOISE * random.standard_normal(n)
+        channels = [Channel(name, times, u) for name, u in zip(names, inputs, strict=True)]
+        context = build_context(
+            [Record(channels, [Channel("y", times, y)])],
+            model,
+            dict.fromkeys((f"a{i}" for i in range(5)), 1.0),
+        )
+        found += list_names(explain_residuals(context))
+    assert "missing dynamics" not in found
+    assert "missing nonlinearity" not in found
 
 
 @pytest.mark.parametrize(("size", "name"), [(1.0, "integration step"), (10.0, "another reading")])
