@@ -422,15 +422,20 @@ class ResidualContext:
         late, members = np.zeros(column.size), self._order[position : self._ends[position]]
         late[members] = column[members]
         moment = float(self.times[self._order[position]])
-        return moment, late, self._describe_moment(position, moment)
+        experiment = self.find_experiment(int(self._order[position]))
+        return moment, late, self.describe_moment(moment, experiment)
 
     def find_shocks(self) -> list[int]:
         """Find the largest innovations, as numbers of samples."""
         sizes = np.abs(self.residual_model.without.innovations)
         return np.argsort(-sizes)[:_SHOCKS].tolist()
 
-    def _describe_moment(self, position: int, moment: float) -> str:
-        experiment = int(self._experiments[self._order[position]])
+    def find_experiment(self, position: int) -> int:
+        """Find the number of the experiment that a sample is of."""
+        return int(self._experiments[position])
+
+    def describe_moment(self, moment: float, experiment: int) -> str:
+        """Describe a moment (s) of an experiment."""
         where = f" of experiment {experiment + 1}" if len(self.problem.records) > 1 else ""
         return f"{moment:.4g} s{where}"
 

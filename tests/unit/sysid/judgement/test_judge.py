@@ -213,6 +213,18 @@ def test_what_explains_the_noise_hides_no_other_explanation(explanation: str, ga
     assert select_explanations((of_noise,), (start,)) == (of_noise, start)
 
 
+def test_a_load_acts_in_its_own_experiment_only() -> None:
+    u, load = draw_levels(1), 0.5 * LATE
+    y = FAST.respond(hold(u + load))[::FINE] + NOISE * draw_noise(1)
+    records = [draw_record(FAST, seed) for seed in (2, 3)]
+    records.insert(1, make_record(u, y))
+    (load_found, *_) = explain(FAST, *records).findings
+    assert load_found.explanation == "load"
+    assert "of experiment 2" in load_found.brief
+    gain = {move.parameter: move.value for move in load_found.moves}["K"]
+    assert gain == pytest.approx(FAST.gain, rel=0.01)
+
+
 def test_a_short_record_with_many_inputs_has_no_dynamics_in_its_noise() -> None:
     names, n = [f"u{i}" for i in range(5)], 52
     model = parse_model(
