@@ -253,7 +253,8 @@ def _describe(
     moves = best.moves or context.compute_moves(best.fit, before, candidate.varies)
     notable = _list_notable(moves)
     for rival in rivals:
-        notable |= _list_notable(context.compute_moves(rival.fit, before, rival.candidate.varies))
+        would = rival.moves or context.compute_moves(rival.fit, before, rival.candidate.varies)
+        notable |= _list_notable(would)
     if candidate.is_vague or _is_large(context, best):
         notable = {move.parameter for move in moves}
     text = f"{candidate.text}."

@@ -31,6 +31,7 @@ _MOST_STATES = 8  # whose starts are looked at
 _SHOCKS = 3  # innovations that are looked at
 _START_SIMULATIONS, _MOST_START_SIMULATIONS = 3, 13  # of the slopes in a start
 _FULL_FIT = 20  # simulations of a full fit and its slopes, for each parameter and one
+_MOST_POWER = 50.0  # of e: a move that is no number is no move
 _OWN_SHARE = 1e-6  # of a column that no parameter explains: less says nothing
 
 
@@ -206,13 +207,29 @@ class ResidualContext:
         return _order_moves(
             Move(
                 name,
-                float(self.theta[number] + moved[number]),
-                float(errors[number]),
+                self.move_value(number, float(moved[number])),
+                self._move_error(number, float(moved[number]), float(errors[number])),
                 float(moved[number] - start[number]) / stderr,
             )
             for number, name in self.declared
             if (stderr := known[name].stderr)
         )
+
+    def move_value(self, number: int, move: float) -> float:
+        """Move the value of a parameter, by a step that is linear on its scale.
+
+        On a log scale a move by the value itself is a factor of e, so no value becomes negative.
+        """
+        value = float(self.theta[number])
+        if not self.problem.evaluator.is_log[number]:
+            return value + move
+        return value * float(np.exp(np.clip(move / value, -_MOST_POWER, _MOST_POWER)))
+
+    def _move_error(self, number: int, move: float, error: float) -> float:
+        """Convert the standard error at the estimate to that of a moved value."""
+        if not self.problem.evaluator.is_log[number]:
+            return error
+        return error * self.move_value(number, move) / float(self.theta[number])
 
     def refit(self, records: Sequence[Record]) -> "Refitted | None":
         """Fit the model again to other records; None if that fails."""
