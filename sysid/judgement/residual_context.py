@@ -322,11 +322,17 @@ class ResidualContext:
         return [column for column in own if column.any()]
 
     def shift_start(self, slope: FloatArray, position: int) -> FloatArray:
-        """Let the effect (n,) of a start begin at a sample: that of a jump of the state there."""
-        part = next(p for p in self.parts if p.rows.start <= position < p.rows.stop)
+        """Let the effect (n,) of a start begin at a sample: that of a jump of the state there.
+
+        It is that on all outputs of its experiment.
+        """
+        experiment, moment = self.find_experiment(position), float(self.times[position])
         shifted = np.zeros(slope.size)
-        length = part.rows.stop - position
-        shifted[position : part.rows.stop] = slope[part.rows][:length]
+        for part in self.parts:
+            first = int(np.searchsorted(part.times, moment))
+            if part.experiment == experiment and first < part.times.size:
+                length = part.times.size - first
+                shifted[part.rows.start + first : part.rows.stop] = slope[part.rows][:length]
         return shifted
 
     def simulate(

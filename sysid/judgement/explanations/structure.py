@@ -89,7 +89,9 @@ def _differentiate(context: ResidualContext) -> FloatArray:
     curvature = np.zeros(context.times.size)
     for part in context.parts:
         if part.times.size > 1:
-            curvature[part.rows] = np.gradient(context.slope[part.rows])
+            with np.errstate(all="ignore"):  # samples of several repeats may share a time
+                found = np.gradient(context.slope[part.rows], part.times)
+            curvature[part.rows] = np.where(np.isfinite(found), found, 0.0)
     return curvature
 
 

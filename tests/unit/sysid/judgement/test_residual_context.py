@@ -260,3 +260,21 @@ def test_slow_changes_of_a_parameter_are_told_inside_its_scale() -> None:
     texts = [one.text for one in explain_residuals(context).findings]
     assert texts
     assert not any("T = -" in text or "about -" in text.partition("T drifts")[2] for text in texts)
+
+
+def test_a_jump_of_a_state_acts_on_all_outputs_of_its_experiment() -> None:
+    times = STEP * np.arange(N)
+    records = [
+        Record(
+            (Channel("u", times, draw_levels(seed)),),
+            (Channel("y", times, draw_noise(seed)), Channel("z", times, draw_noise(seed + 9))),
+        )
+        for seed in (1, 2)
+    ]
+    context = build_context(records, TWO_OUTPUTS, {"a": 1.0})
+    slope = np.exp(-np.tile(times, 4))
+    shifted = context.shift_start(slope, 2 * N + 100)  # of y in experiment 2
+    expected = np.where(times >= times[100], np.exp(-(times - times[100])), 0.0)
+    for number, part in enumerate(context.parts):
+        wanted = expected if part.experiment == 1 else np.zeros(N)
+        np.testing.assert_allclose(shifted[part.rows], wanted, err_msg=str(number))
