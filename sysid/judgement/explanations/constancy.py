@@ -9,8 +9,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from sysid.core.text import plain_unit
 from sysid.core.types import FloatArray
-from sysid.judgement.residual_context import Candidate, ResidualContext
+from sysid.judgement.residual_context import CUT_THERE, Candidate, ResidualContext
 from sysid.judgement.residual_model import ColumnFit
 from sysid.uncertainty.analysis import compute_physical_scale
 
@@ -23,11 +24,12 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
     scale = compute_physical_scale(context.problem, context.theta)
     share = _centre_times(context)
     clock = context.weigh(context.slope)[:, 0]
+    offsets = [context.weight * rows for _, rows, _ in context.iterate_outputs()]
     is_lag_a_clock = False
     for number, name in context.declared:
         column = model.columns[:, number]
-        if not column.any() or _are_alike(column, context.weight):
-            continue  # an offset of the output: a step or a drift of the sensor
+        if not column.any() or any(_are_alike(column, offset) for offset in offsets):
+            continue  # an offset of an output: a step or a drift of its sensor
         is_lag = name in context.delays
         is_clock = is_lag and _are_alike(column, clock)
         is_lag_a_clock |= is_clock
@@ -40,7 +42,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 late[:, None],
                 f"{name} changes at about {moment}",
                 f"{subject} changes at about {moment}",
-                "Identify both parts by themselves: give each a label in a column for --segments.",
+                CUT_THERE,
                 counted=1,
                 describe=_describe_change(context, number, float(scale[number])),
                 varies=(number, 0.0, 1.0),
@@ -76,7 +78,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 f"the clocks jump at about {moment}",
                 f"the offset between the clocks of input and output jumps at about {moment}, or "
                 "rows are missing",
-                "Look for lost rows there, and identify both parts by themselves.",
+                f"Look for lost rows there. {CUT_THERE}",
                 counted=1,
                 moment=at,
             )
@@ -124,7 +126,10 @@ def _describe_drift(context: ResidualContext, number: int, scale: float) -> "_De
 
 
 class _Describe:
-    """Describes two values of a parameter by the coefficient of its column."""
+    """Describes two values of a parameter by the coefficient of its column.
+
+    It says nothing if one of them is out of bounds: the linear step was too long then.
+    """
 
     def __init__(
         self,
@@ -135,12 +140,13 @@ class _Describe:
         shares: tuple[float, float],
     ) -> None:
         self._value, self._number, self._scale = float(context.theta[number]), number, scale
-        self._unit = context.problem.free_parameters[number].unit
+        self._parameter = context.problem.free_parameters[number]
         self._text, self._shares = text, shares
 
     def __call__(self, fit: ColumnFit) -> str:
         middle = self._value + float(fit.coefficients[self._number]) * self._scale
         move = float(fit.coefficients[-1]) * self._scale
-        unit = "" if self._unit == "1" else f" {self._unit}"
-        first, second = (f"{middle + share * move:.4g}{unit}" for share in self._shares)
-        return self._text.format(first, second)
+        unit, values = self._parameter.unit, [middle + share * move for share in self._shares]
+        if any(not self._parameter.lower <= value <= self._parameter.upper for value in values):
+            return ""
+        return self._text.format(*(f"{value:.4g}{plain_unit(unit)}" for value in values))
