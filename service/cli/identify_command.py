@@ -140,7 +140,7 @@ def identify(
         typer.Option(
             metavar=f"[{'|'.join(NOISE_MODELS)}]",
             help="white: least squares. ar1: generalised least squares for first-order noise. "
-            "auto (default): what predicts left-out data better, if residuals are coloured.",
+            "auto (default): ar1 if nothing but noise explains coloured residuals.",
         ),
     ] = None,
     posterior: Annotated[
