@@ -83,7 +83,7 @@ def _tabulate_explanation(finding: Finding, estimates: Sequence[Estimate]) -> Ex
         ExplainedValue(
             join_estimate(move.value, move.stderr), is_notable=abs(move.stderrs) > NOTABLE_MOVE
         )
-        if (move := moves.get(one.name))
+        if (move := moves.get(one.name)) and one.may_be(move.value)
         else ExplainedValue(DASH, is_notable=False)
         for one in estimates
     ]

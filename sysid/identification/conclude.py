@@ -242,7 +242,6 @@ def _build_identification(
                 times,
                 best.lowest_end.theta,
                 is_complete=noise.is_complete,
-                is_chosen=asked.loss.noise_model == "auto",
             ),
             *_list_notes(
                 "posterior", () if posterior is None else describe_posterior(posterior, estimates)

@@ -61,7 +61,8 @@ def find_better_yardstick(
 ) -> Iterator[Finding]:
     """Find a linear black box that predicts left-out blocks clearly better than the model.
 
-    It says that the model fails, not why. So beside an explanation (`is_explained`) it is a note.
+    It says that the model fails, not why. So beside an explanation (`is_explained`) it is a note
+    without advice: that of the explanation helps.
     """
     if yardstick is None or not yardstick.is_clearly_better:
         return
@@ -73,7 +74,7 @@ def find_better_yardstick(
         f"a linear model of order {yardstick.order} explains {other:.0f} %, yours {own:.0f} %",
         f"a linear model of order {yardstick.order} explains {other:.1f} % of {yardstick.output} "
         f"in blocks that were left out of it. This model explains {own:.1f} % of the same samples.",
-        "Choose another model, or look at channels and bounds.",
+        "" if is_explained else "Choose another model, or look at channels and bounds.",
         None if is_explained else 2.0 * yardstick.gain,
         parameters=() if is_explained else tuple(names),
     )

@@ -115,7 +115,7 @@ def _explain(estimate: Estimate, finding: Finding) -> str:
     if finding.reason:
         return finding.reason
     move = next((one for one in finding.moves if one.parameter == estimate.name), None)
-    if move is None or abs(move.stderrs) <= NOTABLE_MOVE:
+    if move is None or abs(move.stderrs) <= NOTABLE_MOVE or not estimate.may_be(move.value):
         return finding.brief
     value = f"{plain_estimate(move.value, move.stderr)}{plain_unit(estimate.unit)}"
     return f"it is {value} if {finding.brief}"

@@ -21,14 +21,14 @@ def find_undetermined(
     problem: Problem, analysis: Analysis, delays: set[str], *, are_residuals_noise: bool
 ) -> Iterator[Finding]:
     """Find what the data do not determine: alone, in combination, or beyond a bound."""
-    free = [one for one in analysis.estimates if one.is_free]
+    free, known = [one for one in analysis.estimates if one.is_free], analysis.uncertainty
     yield from _find_bounds(analysis, free, delays, are_residuals_noise=are_residuals_noise)
-    yield from _find_unidentifiable(free)
+    yield from _find_unidentifiable(free, () if known is None else known.groups)
     yield from _find_constant_inputs(problem, free)
-    if analysis.uncertainty is not None:
+    if known is not None:
         yield from _find_insignificant(free, delays)
-        yield from _find_vague_groups(analysis.uncertainty.groups)
-        yield from _find_inseparable(analysis.uncertainty, free, delays)
+        yield from _find_vague_groups(known.groups)
+        yield from _find_inseparable(known, free, delays)
 
 
 def find_ambiguous(estimates: Sequence[Estimate]) -> Iterator[Finding]:
@@ -90,7 +90,9 @@ def _describe_bound(estimate: Estimate) -> str:
     return f"{estimate.name} lies at its {side} bound {bound:g}{format_unit(estimate.unit)}"
 
 
-def _find_unidentifiable(free: Sequence[Estimate]) -> Iterator[Finding]:
+def _find_unidentifiable(
+    free: Sequence[Estimate], groups: Sequence[IdentifiableCombination]
+) -> Iterator[Finding]:
     alone = [one for one in free if one.status == "unidentifiable"]
     if alone:
         names = [one.name for one in alone]
@@ -108,14 +110,14 @@ def _find_unidentifiable(free: Sequence[Estimate]) -> Iterator[Finding]:
     grouped = [one for one in free if one.status == "group"]
     if grouped:
         names = [one.name for one in grouped]
-        reasons = dict.fromkeys(one.reason for one in grouped if one.reason)
-        told = f": {'; '.join(reasons)}" if reasons else ""
+        listed = ", ".join(group.text for group in groups if set(group.members) & set(names))
         yield Finding(
             "combination",
             "identifiability",
             "caution",
             f"the data determine {join_names(names)} only in combination",
-            f"the data do not determine {join_names(names)} alone, only in combination{told}.",
+            f"the data do not determine {join_names(names)} alone, only in combination"
+            f"{f': {listed}' if listed else ''}.",
             "Use the combinations, or fix a parameter that you know.",
             parameters=tuple(names),
             status="group",
@@ -183,7 +185,7 @@ def _find_inseparable(
     uncertainty: Uncertainty, free: Sequence[Estimate], delays: set[str]
 ) -> Iterator[Finding]:
     """Find time lags not distinguishable from 0 that share their effect with a parameter."""
-    known = {one.name: one for one in free if one.stderr}
+    known = {one.name: one for one in free if one.stderr and one.status != "at bound"}
     small = {
         name
         for name in delays

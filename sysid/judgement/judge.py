@@ -29,7 +29,7 @@ from sysid.judgement.levels import (
     STRONG_ODDS,
     UNLIKELY_MOVE,
 )
-from sysid.judgement.residual_context import Candidate, ResidualContext
+from sysid.judgement.residual_context import CUT_THERE, Candidate, ResidualContext
 from sysid.judgement.residual_model import ColumnFit
 from sysid.results.findings import Finding, Move
 
@@ -47,6 +47,7 @@ _BY_ORDER = ("one more time constant", "filter of a sensor")  # another order is
 _MOST_SHARE = 0.5  # columns for a sample: with 0.8, noise gains 12 in one of 20 records of 30
 _MOST_FINDINGS = 3  # that are found beside each other
 _MOST_TOLD = 3  # moves in a sentence
+_MOST_RIVALS = 2  # in a sentence
 _MOST_REFITTED = 3  # explanations that are fitted in full
 
 
@@ -80,8 +81,8 @@ def explain_residuals(context: ResidualContext) -> Explained:
     """Explain the residuals of an estimate by the likeliest explanations, the largest gain first.
 
     The likeliest one is taken, then the likeliest beside it, as long as one gains clearly
-    (stepwise by Schwarz's criterion). If no simulations are left for some explanations, it is not
-    done.
+    (stepwise by Schwarz's criterion). One that is taken twice, such as a limit at two levels, is
+    told once. If no simulations are left for some explanations, it is not done.
     """
     if not (_is_possible(context) and np.all(np.isfinite(context.simulation))):
         return Explained(is_doubtful=context.simulations.is_cut_short)
@@ -106,7 +107,8 @@ def explain_residuals(context: ResidualContext) -> Explained:
             if best.gain - one.gain < STRONG_ODDS
             and one.candidate.explanation != best.candidate.explanation
         ]
-        findings.append(_describe(context, best, before, rivals))
+        if all(one.brief != best.candidate.brief for one in findings):
+            findings.append(_describe(context, best, before, rivals))
         if best.moves is not None:
             break  # the estimate is another one then
         taken = np.hstack([taken, best.candidate.columns])
@@ -224,7 +226,7 @@ def _part_finalist(
         family="constancy",
         brief=f"{names} {verb} at about {moment:.4g} s",
         text=f"at about {moment:.4g} s {names} {verb}, or what is measured does: {told}",
-        advice="Identify both parts by themselves: give each a label in a column for --segments.",
+        advice=CUT_THERE,
         describe=None,
     )
     return [_Scored(candidate, likeliest.fit, gain, found.moves)]
@@ -242,25 +244,26 @@ def _describe(
     for rival in rivals:
         would = rival.moves or context.compute_moves(rival.fit, before, rival.candidate.varies)
         notable |= _list_notable(would)
+    parameters = tuple(dict.fromkeys(m.parameter for m in moves if m.parameter in notable))
     if candidate.is_vague or _is_large(context, best):
-        notable = {move.parameter for move in moves}
+        parameters = context.problem.free_names
     text = f"{candidate.text}."
-    if candidate.describe is not None:
-        text = f"{text} {candidate.describe(best.fit)}".rstrip()
+    if candidate.describe is not None and (told := candidate.describe(best.fit)):
+        text += f" {told}"
     text += _tell_moves(context, moves)
     if rivals:
-        others = dict.fromkeys(one.candidate.brief for one in rivals)
-        text += f" As likely: {'; '.join(list(others)[:2])}."
+        others = {one.candidate.explanation: one.candidate.brief for one in reversed(rivals)}
+        text += f" As likely: {'; '.join([*reversed(others.values())][:_MOST_RIVALS])}."
     return Finding(
         candidate.explanation,
         candidate.family,
-        "caution" if notable else "note",
+        "caution" if parameters else "note",
         candidate.brief,
         text,
-        candidate.advice if notable else "",
+        candidate.advice if parameters else "",
         best.gain,
         moves,
-        tuple(move.parameter for move in moves if move.parameter in notable),
+        parameters,
     )
 
 
@@ -278,13 +281,13 @@ def _list_notable(moves: Sequence[Move]) -> set[str]:
 
 
 def _tell_moves(context: ResidualContext, moves: Sequence[Move]) -> str:
+    """Tell the largest moves. A step out of the bounds is too long for its value to be told."""
     known = {one.name: one for one in context.analysis.estimates}
     told = [
         f"{move.parameter} = {plain_estimate(move.value, move.stderr)}"
         f"{plain_unit(known[move.parameter].unit)} instead of {known[move.parameter].value:.4g}"
         for move in moves[:_MOST_TOLD]
-        if abs(move.stderrs) > NOTABLE_MOVE
-        and known[move.parameter].lower <= move.value <= known[move.parameter].upper
+        if abs(move.stderrs) > NOTABLE_MOVE and known[move.parameter].may_be(move.value)
     ]
     return f" With that, about {', '.join(told)}." if told else ""
 

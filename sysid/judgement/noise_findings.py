@@ -35,11 +35,10 @@ def find_noise_model(
     squares: FloatArray,
     *,
     is_complete: bool,
-    is_chosen: bool,
 ) -> Iterator[Finding]:
     """Find what the noise model does, or why it does nothing.
 
-    `squares` (D,) are the estimates of least squares. `is_chosen`: ``auto`` chose it.
+    `squares` (D,) are the estimates of least squares.
     """
     if problem.loss.noise_model != "ar1":
         return
@@ -49,12 +48,11 @@ def find_noise_model(
             f"{parameter.name} = {value:.4g}{plain_unit(parameter.unit)}"
             for parameter, value in zip(problem.free_parameters, squares.tolist(), strict=True)
         )
-        why = " Nothing else explains the residuals." if is_chosen else ""
         yield note(
             "coloured noise",
             "noise",
             "estimates and standard errors assume first-order noise with a correlation time of "
-            f"{', '.join(times)}.{why} Plain least squares (loss: {{noise_model: white}}) gives "
+            f"{', '.join(times)}. Plain least squares (loss: {{noise_model: white}}) gives "
             f"{plain}.",
         )
     elif is_complete:

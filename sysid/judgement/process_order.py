@@ -174,16 +174,18 @@ def find_other_orders(
     moved = [fit for fit in others if _is_moved(fit, own)]
     if comparison.preferred_model is None and not moved:
         return
-    listed = ", ".join(_write_delay(comparison, fit) for fit in (own, *others))
+    listed = ", ".join(_write_delay(comparison, fit) for fit in others)
+    instead = f"instead of {estimate.value:.4g}{plain_unit(estimate.unit)}"
     if comparison.preferred_model is None:
         names = join_names([fit.model for fit in comparison.open_fits])
         brief = f"the data do not tell {names} apart"
-        text, advice = f"{brief}: {name} is {listed}.", ""
+        text, advice = f"{brief}: {name} is {listed} {instead}.", ""
     else:
         brief = f"the data prefer {best.model}"
         text = (
             f"the data prefer {best.model} (order {best.order}) to {own.model} (order "
-            f"{own.order}): its BIC is {own.bic - best.bic:.3g} lower. {name} is {listed}."
+            f"{own.order}): its BIC is {own.bic - best.bic:.3g} lower. "
+            f"{name} is {listed} {instead}."
         )
         cure = "Give your model as many time constants, or use" if model != own.model else "Use"
         is_cure = best.leaves_noise and best.order > own.order

@@ -37,6 +37,9 @@ _FULL_FIT = 20  # simulations of a full fit and its slopes, for each parameter a
 _MOST_POWER = 50.0  # of e: a move that is no number is no move
 _OWN_SHARE = 1e-6  # of a column that no parameter explains: less says nothing
 
+CUT_THERE = "Cut the record there into two, and identify each part by itself."
+"""Advice: experiments of one record would share their parameters."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
@@ -461,9 +464,13 @@ class ResidualContext:
         return list(found.values())
 
     def find_late(self, column: FloatArray) -> list[tuple[float, FloatArray, str]]:
-        """Let a column (n,) begin to count at each of the largest innovations, as `find_breaks`."""
+        """Let a column (n,) begin to count at each of the largest innovations, as `find_breaks`.
+
+        Not at the ends of an experiment: what is wrong there is its start.
+        """
         places = {int(row): position for position, row in enumerate(self._order)}
-        return [self._begin_late(column, places[row]) for row in self.find_shocks()]
+        positions = [places[row] for row in self.find_shocks()]
+        return [self._begin_late(column, one) for one in positions if self._may_break[one]]
 
     def _begin_late(self, column: FloatArray, position: int) -> tuple[float, FloatArray, str]:
         late, members = np.zeros(column.size), self._order[position : self._ends[position]]

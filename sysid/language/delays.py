@@ -1,6 +1,6 @@
 """Past values: an index such as ``k - 1 - L/h`` is split into whole samples and a delay."""
 
-from math import floor, isinf
+from math import floor, inf, isinf
 from typing import NamedTuple
 
 from sysid.language.monomials import (
@@ -18,8 +18,7 @@ from sysid.language.tree import Expression, PastValue, Symbol, walk
 from sysid.language.value_intervals import bound_expression
 
 _PERIOD = Symbol("h", "period")
-_MAX_DELAY = {"difference": 1e6, "differential": 1e12}
-"""In samples or s: a longer one is that of a bound that was left out. Records are shorter."""
+_MOST_SAMPLES, _MOST_SECONDS = 1e6, 1e9  # of a delay: thirty years, in slow processes
 
 
 class PastIndex(NamedTuple):
@@ -60,10 +59,12 @@ def _split_bounded(back: LaurentPolynomial, rest: Expression, scope: Scope) -> P
     if not back:
         return PastIndex(0, None)
     # Any period shows an unlimited delay; back[CONSTANT] counts samples or seconds.
-    longest = max(bound_expression(rest, scope.parameters, 1.0)[1], back.get(CONSTANT, 0.0))
-    if longest > _MAX_DELAY[scope.form]:
+    most = _MOST_SECONDS if scope.form == "differential" else _MOST_SAMPLES
+    high = max(bound_expression(rest, scope.parameters, 1.0)[1], back.get(CONSTANT, 0.0))
+    if high > most:
         written = format_expression(rest, scope.clock)
-        return f"the delay {written} has no upper limit inside the bounds of its parameters"
+        limit = f"reaches {high:.3g}, above {most:g}," if high < inf else "has no upper limit"
+        return f"the delay {written} {limit} inside the bounds of its parameters"
     return PastIndex(0, rest) if scope.form == "differential" else _split_offset(back, low, scope)
 
 

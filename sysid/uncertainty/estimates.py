@@ -74,6 +74,10 @@ class Estimate:
         """Whether it was estimated, that is, neither fixed nor tied."""
         return self.status not in ("fixed", "tied")
 
+    def may_be(self, value: float) -> bool:
+        """Whether another value is inside the bounds of the search."""
+        return self.lower <= value <= self.upper
+
 
 @dataclass(frozen=True, slots=True)
 class Criteria:

@@ -114,7 +114,7 @@ class _CheckedStream:
         if len(data) != length:
             raise UnreadableFile(
                 f"the file ends inside {what} ({length} bytes needed, {left} left); "
-                "it is truncated",
+                "it is truncated. `mcap recover` writes what is whole to another file",
                 byte=self.at,
             )
         self.crc = zlib.crc32(data, self.crc)

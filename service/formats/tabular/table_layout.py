@@ -385,7 +385,9 @@ def _check_widths(rows: Sequence[_Row], last: _Row, width: int) -> None:
 
 def _build_header_error(row: int | None) -> UnreadableFile:
     return UnreadableFile(
-        "the first row holds numbers; need a header that names the columns, such as t,u,y", row=row
+        "the first row holds numbers; need a header that names the columns: put a line such as "
+        "t,u,y above it",
+        row=row,
     )
 
 

@@ -234,7 +234,8 @@ def _build_segments(
     ]
     axis, spans = concatenate_segments(times, starts, segment_labels)
     notes.append(
-        f"{', '.join(labels)} divide the file into {len(spans)} segments, one measurement each. "
+        f"{', '.join(labels)} {'divides' if len(labels) == 1 else 'divide'} the file into "
+        f"{len(spans)} segments, one measurement each. "
         "They follow each other on one time axis"
     )
     return axis, spans
@@ -270,12 +271,13 @@ def _check_increasing(times: FloatArray, starts: IntArray, table: Table, time: T
         return
     before, after = float(times[wrong[0]]), float(times[wrong[0] + 1])
     what = "repeats" if before == after else "decreases"
-    hint = "If the file has several measurements, "
+    several = "If the file has several measurements, "
+    hint = f"Remove the row if it is a fault of the logger. {several}"
     advice = Advice("name the columns that number them with ", "segments", ".")
     if is_stamp:
         hint, advice = "If the stamps are too coarse, ", GIVE_PERIOD
     elif before == after:
-        hint += "give the columns that number them as segments. "
+        hint = f"{several}give the columns that number them as segments. "
         hint += "If it is no real time, remove it and "
         advice = GIVE_PERIOD
     raise UnreadableFile(

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sysid.core.types import FloatArray
-from sysid.judgement.residual_context import Candidate, ResidualContext
+from sysid.judgement.residual_context import CUT_THERE, Candidate, ResidualContext
 from sysid.judgement.residual_model import ColumnFit
 from sysid.uncertainty.analysis import compute_physical_scale
 
@@ -23,11 +23,12 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
     scale = compute_physical_scale(context.problem, context.theta)
     share = _centre_times(context)
     clock = context.weigh(context.slope)[:, 0]
+    offsets = [context.weight * rows for _, rows, _ in context.iterate_outputs()]
     is_lag_a_clock = False
     for number, name in context.parameter_numbers:
         column = model.columns[:, number]
-        if not column.any() or _are_alike(column, context.weight):
-            continue  # an offset of the output: a step or a drift of the sensor
+        if not column.any() or any(_are_alike(column, offset) for offset in offsets):
+            continue  # an offset of an output: a step or a drift of its sensor
         is_lag = name in context.delays
         is_clock = is_lag and _are_alike(column, clock)
         is_lag_a_clock |= is_clock
@@ -40,7 +41,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 late[:, None],
                 f"{name} changes at about {moment}",
                 f"{subject} changes at about {moment}",
-                "Identify both parts by themselves: give each a label in a column for --segments.",
+                CUT_THERE,
                 counted=1,
                 describe=_describe_change(context, number, float(scale[number])),
                 varies=(number, 0.0, 1.0),
@@ -76,7 +77,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 f"the clocks jump at about {moment}",
                 f"the offset between the clocks of input and output jumps at about {moment}, or "
                 "rows are missing",
-                "Look for lost rows there, and identify both parts by themselves.",
+                f"Look for lost rows there. {CUT_THERE}",
                 counted=1,
                 moment=at,
             )
@@ -124,7 +125,10 @@ def _describe_drift(context: ResidualContext, number: int, scale: float) -> "_De
 
 
 class _Describe:
-    """Describes two values of a parameter by the coefficient of its column."""
+    """Describes two values of a parameter by the coefficient of its column.
+
+    It says nothing if one of them is out of bounds: the linear step was too long then.
+    """
 
     def __init__(
         self,

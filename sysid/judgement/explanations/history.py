@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.core.errors import SysidError
 from sysid.data.records import Channel, History, Record
-from sysid.judgement.residual_context import Candidate, ResidualContext
+from sysid.judgement.residual_context import CUT_THERE, Candidate, ResidualContext
 from sysid.judgement.start_slopes import list_assumed_starts
 from sysid.judgement.unrecorded_input import compute_reach
 
@@ -65,7 +65,7 @@ def _propose_restarts(context: ResidualContext) -> Iterator[Candidate]:
                 f"the plant jumps at about {told}",
                 f"at about {told} the plant is elsewhere at once: by a pulse of a load, "
                 "rows that are missing, or two records in one",
-                "Identify both parts by themselves: give each a label in a column for --segments.",
+                CUT_THERE,
                 counted=1,
                 moment=moment,
                 is_added=True,

@@ -86,8 +86,8 @@ def _find_tails(
         "outliers",
         "sensor",
         f"{name} has outliers",
-        f"{count} samples of {name} lie far outside its noise: outliers, or drop-outs of the "
-        "sensor",
+        f"{count} sample{'s' if count > 1 else ''} of {name} {'lie' if count > 1 else 'lies'} far "
+        "outside its noise: outliers, or drop-outs of the sensor",
         f"Use loss: {{kind: soft-l1, scale: {scale:.2g}}}.",
         gain,
         moves,

@@ -11,7 +11,7 @@ import numpy as np
 
 from sysid.core.types import BoolArray, FloatArray
 from sysid.core.units import format_unit
-from sysid.judgement.residual_context import Candidate, ResidualContext
+from sysid.judgement.residual_context import CUT_THERE, Candidate, ResidualContext
 
 _LIMIT_SAMPLES, _LIMIT_SHARE = 5, 0.02  # equal readings at an end of the range
 _HINGES = (0.0, 0.1, 0.2, 0.3)  # of the range, from its end
@@ -49,7 +49,7 @@ def _propose_courses(context: ResidualContext, name: str, rows: BoolArray) -> It
             late[:, None],
             f"{name} jumps at about {where}",
             f"{name} jumps at about {where}, by a step of the sensor or a disturbance",
-            "Identify both parts by themselves: give each a label in a column for --segments.",
+            CUT_THERE,
             counted=1,
             moment=moment,
             is_added=True,
@@ -62,7 +62,7 @@ def _propose_courses(context: ResidualContext, name: str, rows: BoolArray) -> It
             f"{name} has another scale from about {where} on",
             f"from about {where} on, {name} has another scale and offset, as after a change of "
             "its unit or of its sensor",
-            "Convert that part, or identify both parts by themselves.",
+            "Convert that part, or cut the record there and identify each part by itself.",
             counted=1,
             moment=moment,
         )
@@ -88,7 +88,7 @@ def _propose_curves(
     low, high = float(np.min(measured[rows])), float(np.max(measured[rows]))
     for limit, side in ((high, 1.0), (low, -1.0)):
         count = int(np.count_nonzero(rows & (measured == limit)))
-        is_seen = count >= max(_LIMIT_SAMPLES, _LIMIT_SHARE * np.count_nonzero(rows))
+        is_seen = _are_many(count, int(np.count_nonzero(rows)))
         for hinge in _HINGES:
             level = limit - side * hinge * (high - low)
             beyond = np.where(rows, np.maximum(side * (simulated - level), 0.0), 0.0)
@@ -147,7 +147,7 @@ def _propose_old_readings(
     for part in context.parts:
         if part.output == name:
             measured, simulated = context.measurement[part.rows], context.simulation[part.rows]
-            equal = np.concatenate([[False], np.diff(measured) == 0])
+            equal = np.concatenate([[False], np.diff(measured) == 0]) & ~_find_limited(measured)
             is_repeated |= bool(np.mean(equal) > _REPEATED_SHARE) or _count_longest(equal) > 9
             last = np.maximum.accumulate(np.where(equal, 0, np.arange(equal.size)))
             older[part.rows] = simulated[last] - simulated
@@ -176,6 +176,21 @@ def _propose_old_readings(
                 "",
                 counted=1,
             )
+
+
+def _find_limited(measured: FloatArray) -> BoolArray:
+    """Find readings at an end of the range that has many: a sensor at its limit, not an old one."""
+    limited = np.zeros(measured.size, dtype=np.bool_)
+    for limit in (np.max(measured), np.min(measured)):
+        is_there = measured == limit
+        if _are_many(int(np.count_nonzero(is_there)), measured.size):
+            limited |= is_there
+    return limited
+
+
+def _are_many(readings: int, samples: int) -> bool:
+    """Whether so many equal readings at an end of the range are those of a limit."""
+    return readings >= max(_LIMIT_SAMPLES, _LIMIT_SHARE * samples)
 
 
 def _count_longest(flags: BoolArray) -> int:

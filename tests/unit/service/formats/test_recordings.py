@@ -294,7 +294,7 @@ REFUSED = {
     ),
     "units in cells": (join_rows("t,u,y", end=" V"), "write numbers alone, and their unit"),
     "thousands": ("t;y\n0.1;1,000.5\n0.2;1,001.5\n", "thousands separators"),
-    "no header": (BODY, "need a header that names the columns"),
+    "no header": (BODY, "need a header that names the columns: put a line such as t,u,y"),
     "no time": (join_rows("a,u,y"), "give the sampling period"),
     "JSON": ('{"t": [0, 1], "u": [0, 1]}', "the file is JSON, which is not read; write the"),
     "JSON lines": ('[{"t": 0}]', "JSON"),

@@ -62,6 +62,16 @@ def test_each_explanation_tells_what_a_moved_parameter_would_be() -> None:
     ]
 
 
+def test_a_value_out_of_bounds_is_not_told() -> None:
+    found = find(CHANGE)
+    lag = next(one for one in found.parameters if one.name == "L")
+    table = tabulate_explanations(
+        find(replace(CHANGE, moves=(Move("L", lag.lower - 1.0, 0.1, -40.0),)))
+    )
+    assert table is not None
+    assert [cell.text for cell in table.rows[1].cells] == ["–"]
+
+
 @pytest.mark.parametrize(
     "findings", [(), (note("ridge", "identifiability", "T and L are alike"),)], ids=["none", "note"]
 )

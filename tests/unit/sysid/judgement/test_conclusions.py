@@ -170,3 +170,9 @@ def test_what_is_said_twice_is_told_once() -> None:
     _, verdict = conclude(CONSTANT, again)
     assert verdict.text.count("the model does not explain the output") == 1
     assert list_warnings((CONSTANT, again)) == (CONSTANT.sentences,)
+
+
+def test_a_value_out_of_bounds_is_no_reason() -> None:
+    moved = replace(ORDER, moves=(Move("L", -1.0, 0.02, -90.0),))
+    (_, lag), _ = conclude(moved)
+    assert (lag.status, lag.reason) == ("dependent", "the data prefer sopdt")

@@ -69,11 +69,13 @@ def test_a_value_that_the_data_do_not_determine_is_named_with_its_reason() -> No
 
 
 def test_values_that_are_determined_together_are_named_with_the_combination() -> None:
-    both = [make_estimate(name, "group", reason="a*b") for name in "ab"]
-    (found,) = find(K, *both)
-    assert found.parameters == ("a", "b")
-    assert found.text.count("a*b") == 1
-    assert found.brief == "the data determine a and b only in combination"
+    both = [make_estimate(name, "group", reason=f"of {name}") for name in "abc"]
+    groups = [IdentifiableCombination(("a", "b"), "a*b", 1.0, 0.1)]
+    groups += [IdentifiableCombination(("a", "c"), "a*c", 1.0, 0.1, is_local=True)]
+    (found,) = find(K, *both, groups=tuple(groups))
+    assert found.parameters == ("a", "b", "c")
+    assert found.text.endswith(": a*b, a*c (near the estimate).")
+    assert found.brief == "the data determine a, b and c only in combination"
 
 
 @pytest.mark.parametrize(("are_noise", "severity"), [(True, "caution"), (False, "caution")])

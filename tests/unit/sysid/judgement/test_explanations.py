@@ -34,6 +34,8 @@ from tests.support.library.judged_records import (
     draw_noise,
     draw_record,
     explain,
+    explain_input,
+    explain_output,
     hold,
     list_names,
     make_record,
@@ -69,7 +71,8 @@ def test_a_defect_is_found_by_its_name(case: DefectCase, plant: Process) -> None
     assert first.gain > DEFECT_GAIN
     assert first.text.endswith(".")
     assert (first.severity == "caution") == bool(first.parameters)
-    assert {*first.parameters} <= {move.parameter for move in first.moves}
+    doubtful, moved = {*first.parameters}, {move.parameter for move in first.moves}
+    assert doubtful <= moved or doubtful > moved, "those that move, or all, starts included"
     sizes = [abs(move.stderrs) for move in first.moves]
     assert sizes == sorted(sizes, reverse=True)
 
@@ -175,3 +178,33 @@ def test_each_experiment_is_named() -> None:
     sound, changed = draw_record(FAST, 1), SENSOR[1].draw(FAST, 2)
     first = explain(FAST, sound, changed).findings[0]
     assert "of experiment 2" in first.brief
+
+
+@pytest.mark.parametrize("seed", draw_seeds(gate=2, night=10))
+def test_a_sensor_at_its_limit_is_not_said_to_repeat_old_readings(seed: int) -> None:
+    explained = explain_output(FAST, seed, lambda y: np.minimum(y, np.quantile(y, 0.7)))
+    assert list_names(explained)[0] == "limit of a sensor"
+    assert "repeated reading" not in list_names(explained)
+    assert all("old readings" not in one.text for one in explained.findings)
+
+
+@pytest.mark.parametrize("seed", draw_seeds(gate=2, night=10))
+def test_an_actuator_at_its_limit_is_told_once(seed: int) -> None:
+    explained = explain_input(FAST, seed, lambda u: np.minimum(u, 1.0))
+    briefs = [one.brief for one in explained.findings]
+    assert len(briefs) == len(set(briefs))
+
+
+def test_a_change_is_not_looked_for_where_a_record_begins() -> None:
+    record = draw_record(FAST, 1)
+    shocked = record.outputs[0].values.copy()
+    shocked[[2, 150]] += 5.0
+    context = build_context(
+        [replace(record, outputs=(replace(record.outputs[0], values=shocked),))],
+        FAST.model,
+        FAST.values,
+    )
+    assert {2, 150} <= set(context.find_shocks())
+    moments = [moment for moment, *_ in context.find_late(np.ones(context.times.size))]
+    assert context.times[150] in moments
+    assert context.times[2] not in moments

@@ -79,9 +79,7 @@ def test_a_prediction_of_a_model_that_reads_no_output_is_told_to_be_a_free_run()
     assert list(find_useless_prediction(tube)) == []
 
 
-def list_noise(
-    noise_model: str, time: float, *, is_complete: bool = True, is_chosen: bool = False
-) -> list[Finding]:
+def list_noise(noise_model: str, time: float, *, is_complete: bool = True) -> list[Finding]:
     problem = Problem.build(
         parse_model(LINE),
         [make_record(TIMES, TIMES)],
@@ -93,7 +91,6 @@ def list_noise(
             {"y": time},
             np.array([2.0, 1.0]),
             is_complete=is_complete,
-            is_chosen=is_chosen,
         )
     )
 
@@ -104,9 +101,6 @@ def test_a_noise_model_is_told_with_the_estimates_of_plain_squares() -> None:
     assert found.severity == "note"
     assert "correlation time of y 3 s" in found.text
     assert "(loss: {noise_model: white}) gives a = 2, b = 1." in found.text
-    assert "Nothing else" not in found.text
-    (chosen,) = list_noise("ar1", 3.0, is_chosen=True)
-    assert "Nothing else explains the residuals." in chosen.text
 
 
 def test_a_noise_model_that_changes_nothing_or_is_not_complete_says_so() -> None:

@@ -87,7 +87,7 @@ SCOPE = Scope(
         ("x(k - 1.5 + 2*c)", 1, "its smallest value is -0.5 samples"),
         ("q(k + c)", 1, "its smallest value is -1 samples"),
         ("q(k - 1/c)", 1, "has no upper limit"),
-        ("q(k - 1e9)", 1, "has no upper limit"),
+        ("q(k - 1e9)", 1, "reaches 1e+09, above 1e+06,"),
         ("q(k - 1e300*1e300)", 1, "has no upper limit"),
         ("q(k - 1/0)", 1, "may be negative"),
         ("q(k + L/h)", 1, "its smallest value is -1 s"),
