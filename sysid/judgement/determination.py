@@ -138,7 +138,7 @@ def _find_constant_inputs(problem: Problem, free: Sequence[Estimate]) -> Iterato
             yield Finding(
                 "constant input",
                 "record",
-                "serious" if len(problem.model.inputs) == 1 else "caution",
+                "caution",
                 f"{quantity.name} is constant",
                 f"input {quantity.name!r} is constant, so it excites nothing. These data leave "
                 f"unidentified: {', '.join(unknown)}.",

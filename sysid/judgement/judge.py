@@ -260,7 +260,7 @@ def _describe(
         "caution" if parameters else "note",
         candidate.brief,
         text,
-        candidate.advice if parameters else "",
+        candidate.advice if parameters or candidate.family == "start" else "",
         best.gain,
         moves,
         parameters,

@@ -105,7 +105,7 @@ def test_a_missing_time_constant_is_told_with_the_dead_time_of_the_other_order(
     assert second.values["r"] * second.values["T1"] == pytest.approx(0.3, abs=0.05)
     [warning] = find_order_warnings(missing)
     assert warning.startswith("the data prefer sopdt (order 2) to fopdt (order 1): its BIC is ")
-    assert f", {value} with sopdt." in warning
+    assert f"L is {value} with sopdt instead of " in warning
     assert f"L is {found.own_fit.delay:.3f} ± " in warning
     assert warning.endswith(" Use the model sopdt.")
     assert "the data prefer sopdt" in repr(missing)
