@@ -5,14 +5,17 @@ from math import isfinite
 
 import numpy as np
 
+from sysid.core.distributions import chi_square_limit
 from sysid.core.text import join_names
 from sysid.core.units import format_unit
+from sysid.judgement.levels import UNLIKELY
 from sysid.judgement.yardstick import Yardstick
 from sysid.results.findings import Finding, Severity
 from sysid.simulation.fit_metrics import ChannelMetrics, Metrics
 from sysid.simulation.problem import Problem
 
 _LITTLE = 30.0  # %: a smaller fit beside residuals that are not noise is a failure
+_SHARE_OF_DEGREES = 0.25  # of the samples: degrees of freedom of a variance, if the pole is 0.77
 
 
 def find_disagreement(
@@ -101,7 +104,11 @@ def find_constant_outputs(problem: Problem) -> Iterator[Finding]:
 
 
 def _find_straight_lines(channels: Sequence[ChannelMetrics]) -> Iterator[Finding]:
-    """Find outputs that a straight line explains better, over all experiments or in one."""
+    """Find outputs that a straight line explains better, over all experiments or in one.
+
+    In an experiment in which nothing moves a line always fits better, as it has more parameters
+    for the same noise. So it is a doubt only where the model leaves more than elsewhere.
+    """
     outputs = dict.fromkeys(one.output for one in channels if one.is_worse_than_line)
     failed = [name for name in outputs if _is_worse_than_line(channels, name)]
     has_several = any(channel.experiment for channel in channels)
@@ -109,10 +116,11 @@ def _find_straight_lines(channels: Sequence[ChannelMetrics]) -> Iterator[Finding
         if not channel.is_worse_than_line:
             continue
         where = f" of experiment {channel.experiment + 1}" if has_several else ""
+        severity: Severity = "caution" if _leaves_more(channel, channels) else "note"
         yield Finding(
             "straight line",
             "structure",
-            "serious" if channel.output in failed else "caution",
+            "serious" if channel.output in failed else severity,
             f"a straight line explains {join_names(failed)} better"
             if failed
             else f"a straight line explains a part of {join_names(list(outputs))} better",
@@ -123,6 +131,15 @@ def _find_straight_lines(channels: Sequence[ChannelMetrics]) -> Iterator[Finding
             else "These records tell little of the model, or it does not hold there.",
             status="refuted",
         )
+
+
+def _leaves_more(channel: ChannelMetrics, channels: Sequence[ChannelMetrics]) -> bool:
+    """Whether the model leaves more of an output in an experiment than over all of them."""
+    own = [one for one in channels if one.output == channel.output]
+    samples = sum(one.samples for one in own)
+    variance = sum(one.samples * one.rms**2 for one in own) / samples
+    degrees = max(round(_SHARE_OF_DEGREES * channel.samples), 1)
+    return channel.rms**2 > variance * chi_square_limit(degrees, UNLIKELY) / degrees
 
 
 def _is_worse_than_line(channels: Sequence[ChannelMetrics], output: str) -> bool:

@@ -44,6 +44,7 @@ _COSTLY_PROPOSERS = (actuator.propose, actuator.propose_loads)
 """Each of their explanations takes a simulation: only if the residuals depend on anything."""
 _LIKELY = 0.01  # of a likelihood ratio: with some forty candidates, of which many are alike
 _BY_ORDER = ("one more time constant", "filter of a sensor")  # another order is the full fit
+_MOST_SHARE = 0.5  # columns for a sample: with 0.8, noise gains 12 in one of 20 records of 30
 _MOST_FINDINGS = 3  # that are found beside each other
 _MOST_TOLD = 3  # moves in a sentence
 _MOST_REFITTED = 3  # explanations that are fitted in full
@@ -143,7 +144,10 @@ def _list_candidates(
 ) -> Iterator[Candidate]:
     for propose in proposers:
         for candidate in propose(context):
-            if candidate.columns.any() and np.all(np.isfinite(candidate.columns)):
+            columns = candidate.columns
+            used = context.theta.size + columns.shape[1]
+            is_fit = used <= _MOST_SHARE * context.times.size and np.all(np.isfinite(columns))
+            if is_fit and columns.any():
                 yield candidate
 
 
@@ -236,7 +240,8 @@ def _describe(
     moves = best.moves or context.compute_moves(best.fit, before, candidate.varies)
     notable = _list_notable(moves)
     for rival in rivals:
-        notable |= _list_notable(context.compute_moves(rival.fit, before, rival.candidate.varies))
+        would = rival.moves or context.compute_moves(rival.fit, before, rival.candidate.varies)
+        notable |= _list_notable(would)
     if candidate.is_vague or _is_large(context, best):
         notable = {move.parameter for move in moves}
     text = f"{candidate.text}."

@@ -2,6 +2,9 @@
 
 from collections.abc import Iterator
 
+import numpy as np
+
+from sysid.core.types import FloatArray
 from sysid.kernels.signals.past_reads import list_delayed_values
 from sysid.models.unit_checks import (
     list_mixed_unit_warnings,
@@ -35,8 +38,13 @@ def find_early_responses(problem: Problem) -> Iterator[Finding]:
     """Find outputs that leave their rest before any input has moved."""
     if not list_delayed_values(problem.model, "input"):
         return
+    spans = {
+        one.name: float(np.ptp(values))
+        for one in problem.model.outputs
+        if (values := _join_outputs(problem, one.name)).size
+    }
     for number, record in enumerate(problem.records, 1):
-        if unprompted := find_unprompted_output(record):
+        if unprompted := find_unprompted_output(record, spans):
             where = f" in experiment {number}" if len(problem.records) > 1 else ""
             yield Finding(
                 "response before its cause",
@@ -49,6 +57,15 @@ def find_early_responses(problem: Problem) -> Iterator[Finding]:
                 "Put some rows of the input at rest before the record, or look at the clocks.",
                 parameters=(),
             )
+
+
+def _join_outputs(problem: Problem, name: str) -> FloatArray:
+    """Join the measured values (N,) of an output over all records."""
+    values = [
+        one.values for record in problem.records for one in record.outputs if one.name == name
+    ]
+    joined = np.concatenate(values)
+    return np.asarray(joined[np.isfinite(joined)])
 
 
 def find_useless_prediction(problem: Problem) -> Iterator[Finding]:

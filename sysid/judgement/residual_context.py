@@ -34,6 +34,7 @@ _FINER = 4  # times as many integration steps
 _SHOCKS = 3  # innovations that are looked at
 _START_SIMULATIONS, _MOST_START_SIMULATIONS = 3, 13  # of the slopes in a start
 _FULL_FIT = 20  # simulations of a full fit and its slopes, for each parameter and one
+_MOST_POWER = 50.0  # of e: a move that is no number is no move
 _OWN_SHARE = 1e-6  # of a column that no parameter explains: less says nothing
 
 
@@ -232,14 +233,30 @@ class ResidualContext:
         return _order_moves(
             Move(
                 name,
-                float(self.theta[number] + end),
-                float(errors[number]),
+                self.move_value(number, end),
+                self._move_error(number, end, float(errors[number])),
                 float(end - start[number]) / stderr,
             )
             for number, name in self.parameter_numbers
             if (stderr := known[name].stderr)
             for end in ends[number]
         )
+
+    def move_value(self, number: int, move: float) -> float:
+        """Move the value of a parameter, by a step that is linear on its scale.
+
+        On a log scale a move by the value itself is a factor of e, so no value becomes negative.
+        """
+        value = float(self.theta[number])
+        if not self.problem.evaluator.is_log[number]:
+            return value + move
+        return value * float(np.exp(np.clip(move / value, -_MOST_POWER, _MOST_POWER)))
+
+    def _move_error(self, number: int, move: float, error: float) -> float:
+        """Convert the standard error at the estimate to that of a moved value."""
+        if not self.problem.evaluator.is_log[number]:
+            return error
+        return error * self.move_value(number, move) / float(self.theta[number])
 
     def refit(self, records: Sequence[Record]) -> "Refitted | None":
         """Fit the model again to other records; None if that fails."""
@@ -332,11 +349,17 @@ class ResidualContext:
         return [column for column in own if column.any()]
 
     def shift_start(self, slope: FloatArray, position: int) -> FloatArray:
-        """Let the effect (n,) of a start begin at a sample: that of a jump of the state there."""
-        part = next(p for p in self.parts if p.rows.start <= position < p.rows.stop)
+        """Let the effect (n,) of a start begin at a sample: that of a jump of the state there.
+
+        It is that on all outputs of its experiment.
+        """
+        experiment, moment = self.find_experiment(position), float(self.times[position])
         shifted = np.zeros(slope.size)
-        length = part.rows.stop - position
-        shifted[position : part.rows.stop] = slope[part.rows][:length]
+        for part in self.parts:
+            first = int(np.searchsorted(part.times, moment))
+            if part.experiment == experiment and first < part.times.size:
+                length = part.times.size - first
+                shifted[part.rows.start + first : part.rows.stop] = slope[part.rows][:length]
         return shifted
 
     def simulate(
@@ -446,15 +469,20 @@ class ResidualContext:
         late, members = np.zeros(column.size), self._order[position : self._ends[position]]
         late[members] = column[members]
         moment = float(self.times[self._order[position]])
-        return moment, late, self._describe_moment(position, moment)
+        experiment = self.find_experiment(int(self._order[position]))
+        return moment, late, self.describe_moment(moment, experiment)
 
     def find_shocks(self) -> list[int]:
         """Find the largest innovations, as numbers of samples."""
         sizes = np.abs(self.residual_model.without.innovations)
         return [int(row) for row in np.argsort(-sizes)[:_SHOCKS]]
 
-    def _describe_moment(self, position: int, moment: float) -> str:
-        experiment = int(self._experiments[self._order[position]])
+    def find_experiment(self, position: int) -> int:
+        """Find the number of the experiment that a sample is of."""
+        return int(self._experiments[position])
+
+    def describe_moment(self, moment: float, experiment: int) -> str:
+        """Describe a moment (s) of an experiment."""
         where = f" of experiment {experiment + 1}" if len(self.problem.records) > 1 else ""
         return f"{moment:.4g} s{where}"
 

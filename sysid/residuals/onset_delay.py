@@ -19,7 +19,7 @@ moves at its samples. A median needs a limited number of events. If there are mo
 evenly spread over the record and out of step with any pattern in it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import inf, sqrt
@@ -115,12 +115,15 @@ def estimate_onset_delays(model: Model, records: Sequence[Record]) -> tuple[Onse
     )
 
 
-def find_unprompted_output(record: Record) -> tuple[str, float] | None:
+def find_unprompted_output(
+    record: Record, spans: Mapping[str, float] | None = None
+) -> tuple[str, float] | None:
     """Find the first output that moves before any input, and when (s); None if there is none.
 
     A record that begins with the step itself looks like this, because the step precedes all
     samples. The output must move a tenth of its range before an input moves a hundredth of its own.
-    If both grow slowly from nothing, either can be the first to leave its rest.
+    If both grow slowly from nothing, either can be the first to leave its rest. `spans` are the
+    ranges of the outputs over all records: in one in which nothing moves, noise has all the range.
     """
     first_input_move = min(
         (_find_first_move(channel.history_and_samples) for channel in record.inputs), default=-inf
@@ -134,7 +137,8 @@ def find_unprompted_output(record: Record) -> tuple[str, float] | None:
             continue
         rest = times <= rest_end
         distance = np.abs(values[times <= first_input_move] - np.mean(values[rest]))
-        if float(np.max(distance)) < _NOTABLE_STEP * float(np.ptp(values)):
+        span = max(float(np.ptp(values)), (spans or {}).get(output.name, 0.0))
+        if float(np.max(distance)) < _NOTABLE_STEP * span:
             continue
         if _extrapolate_creep(
             times[rest], values[rest], rest_end

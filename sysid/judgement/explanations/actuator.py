@@ -17,6 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
+from sysid.data.records import Record
 from sysid.judgement.residual_context import Candidate, ResidualContext
 from sysid.judgement.unrecorded_input import compute_reach
 from sysid.results.findings import Family
@@ -83,35 +84,40 @@ def propose_loads(context: ResidualContext) -> Iterator[Candidate]:
     reach = compute_reach(context.problem, context.analysis)
     for channel, position in product(context.moving_inputs[:1], context.find_shocks()):
         begin = float(context.times[position]) - reach
-        records = [
-            replace(
-                record,
-                inputs=tuple(
-                    replace(
-                        one,
-                        values=one.values + np.where(one.times >= begin, np.ptp(one.values), 0.0),
-                        hold=one.effective_hold,
-                    )
-                    if one.name == channel.name
-                    else one
-                    for one in record.inputs
-                ),
-            )
-            for record in context.problem.records
-        ]
+        experiment = context.find_experiment(position)
+        records = list(context.problem.records)
+        records[experiment] = _add_step(
+            records[experiment], channel.name, begin, float(np.ptp(channel.values))
+        )
         with suppress(SysidError):
             moved = context.simulate(records) - context.simulation
             if np.all(np.isfinite(moved)) and moved.any():
+                moment = context.describe_moment(begin, experiment)
                 yield Candidate(
                     "load",
                     "input",
                     context.weigh(moved),
-                    f"a load acts from about {begin:.4g} s on",
-                    f"from about {begin:.4g} s on a load acts on the plant beside {channel.name}, "
+                    f"a load acts from about {moment} on",
+                    f"from about {moment} on a load acts on the plant beside {channel.name}, "
                     "or another input",
                     "Record the load as an input.",
                     counted=1,
                 )
+
+
+def _add_step(record: Record, name: str, begin: float, size: float) -> Record:
+    """Add a step of a size to an input from a time (s) on."""
+    inputs = (
+        replace(
+            one,
+            values=one.values + np.where(one.times >= begin, size, 0.0),
+            hold=one.effective_hold,
+        )
+        if one.name == name
+        else one
+        for one in record.inputs
+    )
+    return replace(record, inputs=tuple(inputs))
 
 
 def _list_changes(name: str, low: float, high: float, span: float) -> Iterator[_Change]:

@@ -134,16 +134,19 @@ class _Describe:
         text: str,
         shares: tuple[float, float],
     ) -> None:
-        self._value, self._number, self._scale = float(context.theta[number]), number, scale
+        self._context, self._number, self._scale = context, number, scale
         parameter = context.problem.free_parameters[number]
         self._unit, self._bounds = parameter.unit, (parameter.lower, parameter.upper)
         self._text, self._shares = text, shares
 
     def __call__(self, fit: ColumnFit) -> str:
-        middle = self._value + float(fit.coefficients[self._number]) * self._scale
-        move = float(fit.coefficients[-1]) * self._scale
+        middle = float(fit.coefficients[self._number]) * self._scale
+        change = float(fit.coefficients[-1]) * self._scale
         unit = "" if self._unit == "1" else f" {self._unit}"
-        ends = [middle + share * move for share in self._shares]
+        ends = [
+            self._context.move_value(self._number, middle + share * change)
+            for share in self._shares
+        ]
         if not all(self._bounds[0] <= end <= self._bounds[1] for end in ends):
             return ""  # too far for a linear step
         first, second = (f"{end:.4g}{unit}" for end in ends)

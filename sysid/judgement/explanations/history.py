@@ -57,12 +57,13 @@ def _propose_restarts(context: ResidualContext) -> Iterator[Candidate]:
         moved = [column for column in columns if column.any()]
         if moved and position > 0:
             moment = float(context.times[position])
+            told = context.describe_moment(moment, context.find_experiment(position))
             yield Candidate(
                 "jump of the states",
                 "record",
                 np.column_stack(moved),
-                f"the plant jumps at about {moment:.4g} s",
-                f"at about {moment:.4g} s the plant is elsewhere at once: by a pulse of a load, "
+                f"the plant jumps at about {told}",
+                f"at about {told} the plant is elsewhere at once: by a pulse of a load, "
                 "rows that are missing, or two records in one",
                 "Identify both parts by themselves: give each a label in a column for --segments.",
                 counted=1,

@@ -15,6 +15,7 @@ from sysid.judgement.residual_context import Candidate, ResidualContext
 
 _PARTS = (1.0, 3.0, 10.0, 30.0, 100.0)  # time constants of the new part, in samples
 _LAGS = 12  # past values of each input, denser towards the present, over a quarter of the record
+_SAMPLES_PER_LAG = 4  # at least: of a short record with many inputs fewer values are looked at
 
 
 def propose(context: ResidualContext) -> Iterator[Candidate]:
@@ -94,14 +95,18 @@ def _differentiate(context: ResidualContext) -> FloatArray:
     curvature = np.zeros(context.times.size)
     for part in context.parts:
         if part.times.size > 1:
-            curvature[part.rows] = np.gradient(context.slope[part.rows])
+            with np.errstate(all="ignore"):  # samples of several repeats may share a time
+                found = np.gradient(context.slope[part.rows], part.times)
+            curvature[part.rows] = np.where(np.isfinite(found), found, 0.0)
     return curvature
 
 
 def _list_past_inputs(context: ResidualContext) -> Iterator[FloatArray]:
     """List columns (n,) of past values of each input that moves."""
     longest = max(part.times.size for part in context.parts)
-    lags = np.unique(np.geomspace(1.0, max(longest / 4, 1.0), _LAGS).astype(np.int64)) - 1
+    most = context.times.size // (_SAMPLES_PER_LAG * max(len(context.moving_inputs), 1))
+    lags = np.geomspace(1.0, max(longest / 4, 1.0), min(_LAGS, max(most, 1)))
+    lags = np.unique(lags.astype(np.int64)) - 1
     for channel in context.moving_inputs:
         for lag in lags.tolist():
             column = context.read_input(channel.name, lag)

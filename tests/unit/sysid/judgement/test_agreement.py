@@ -73,9 +73,17 @@ def test_a_straight_line_that_explains_the_whole_better_is_serious() -> None:
 
 
 def test_a_straight_line_through_a_part_is_a_caution_with_its_experiment() -> None:
-    (found,) = find(95.0, make_channel(0.1, 2.0), make_channel(0.11, 0.1, 1))
+    (found,) = find(
+        95.0, make_channel(0.1, 2.0), make_channel(0.1, 2.0, 2), make_channel(0.3, 0.1, 1)
+    )
     assert found.severity == "caution"
     assert found.brief == "a straight line explains a part of y better"
+    assert "y of experiment 2" in found.text
+
+
+def test_a_straight_line_through_the_noise_of_an_experiment_at_rest_is_a_note() -> None:
+    (found,) = find(95.0, make_channel(0.1, 2.0), make_channel(0.11, 0.1, 1))
+    assert found.severity == "note"
     assert "y of experiment 2" in found.text
 
 

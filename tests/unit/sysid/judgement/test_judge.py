@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sysid.core.settings import Loss
+from sysid.data.records import Channel, Record
 from sysid.judgement.conclusions import order_findings
 from sysid.judgement.judge import Explained, explain_residuals, select_explanations
 from sysid.judgement.levels import DEFECT_GAIN, STRONG_ODDS
@@ -18,6 +19,7 @@ from tests.support.library.judged_records import (
     FAST,
     FINE,
     NOISE,
+    STEP,
     N,
     build_context,
     draw_levels,
@@ -208,6 +210,49 @@ def test_what_explains_the_noise_hides_no_other_explanation(explanation: str, ga
     assert select_explanations((drift, of_noise), (order,)) == (of_noise, order)
     start = make_finding("start", -3.0, "L")
     assert select_explanations((of_noise,), (start,)) == (of_noise, start)
+
+
+def test_a_load_acts_in_its_own_experiment_only() -> None:
+    u, load = draw_levels(1), 0.5 * LATE
+    y = FAST.respond(hold(u + load))[::FINE] + NOISE * draw_noise(1)
+    records = [draw_record(FAST, seed) for seed in (2, 3)]
+    records.insert(1, make_record(u, y))
+    (load_found, *_) = explain(FAST, *records).findings
+    assert load_found.explanation == "load"
+    assert "of experiment 2" in load_found.brief
+    gain = {move.parameter: move.value for move in load_found.moves}["K"]
+    assert gain == pytest.approx(FAST.gain, rel=0.01)
+
+
+def test_a_short_record_with_many_inputs_has_no_dynamics_in_its_noise() -> None:
+    names, n = [f"u{i}" for i in range(5)], 52
+    model = parse_model(
+        {
+            "name": "sum",
+            "form": "differential",
+            "inputs": dict.fromkeys(names, "1"),
+            "states": {"x": "1"},
+            "parameters": {f"a{i}": {"lower": -10, "upper": 10, "unit": "1"} for i in range(5)},
+            "equations": {"x": "-x"},
+            "outputs": {"y": "x + " + " + ".join(f"a{i}*u{i}" for i in range(5))},
+            "initial": {"x": 0},
+            "solver": {"method": "rk4", "step": "sample", "substeps": 1},
+        }
+    )
+    found = list[str]()
+    for seed in range(12):
+        random = np.random.default_rng(seed)
+        times, inputs = STEP * np.arange(n), random.standard_normal((5, n))
+        y = np.sum(inputs, axis=0) + NOISE * random.standard_normal(n)
+        channels = [Channel(name, times, u) for name, u in zip(names, inputs, strict=True)]
+        context = build_context(
+            [Record(channels, [Channel("y", times, y)])],
+            model,
+            dict.fromkeys((f"a{i}" for i in range(5)), 1.0),
+        )
+        found += list_names(explain_residuals(context))
+    assert "missing dynamics" not in found
+    assert "missing nonlinearity" not in found
 
 
 def test_outliers_hide_no_change_and_no_change_hides_them() -> None:

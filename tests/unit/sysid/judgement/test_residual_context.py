@@ -7,6 +7,7 @@ import pytest
 
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
+from sysid.judgement.judge import explain_residuals
 from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
@@ -238,3 +239,52 @@ def test_errors_of_the_integration_are_taken_out_of_records_that_have_them(
     rest = -context.analysis.residuals_and_sensitivities[0]
     wanted = rest - context.weigh(added)[:, 0] if has_errors else rest
     np.testing.assert_array_equal(context.residual_model.residuals, wanted)
+
+
+def test_moves_on_a_log_scale_keep_the_sign_of_a_value() -> None:
+    context = build_context([draw_record(FAST, 1)], "fopdt", FAST.values)
+    names = list(context.problem.free_names)
+    scaled, plain = names.index("T"), names.index("L")
+    value = float(context.theta[scaled])
+    assert context.move_value(scaled, -2.0 * value) == pytest.approx(value * np.exp(-2.0))
+    assert context.move_value(scaled, 1e-6) == pytest.approx(value + 1e-6)
+    assert context.move_value(plain, -0.5) == pytest.approx(float(context.theta[plain]) - 0.5)
+    fit = context.residual_model.without
+    far = fit.coefficients.copy()
+    far[scaled] = -3.0 * fit.errors[scaled]
+    (move,) = [
+        one for one in context.compute_moves(fit._replace(coefficients=far)) if one.parameter == "T"
+    ]
+    assert move.stderr is not None
+    assert 0.0 < move.value < value
+    assert np.log(move.value / value) == pytest.approx(-3.0 * move.stderr / move.value)
+
+
+def test_slow_changes_of_a_parameter_are_told_inside_its_scale() -> None:
+    u = draw_levels(1)
+    share = np.linspace(0.0, 1.0, N)
+    slow = replace(FAST, times=(12.0,))
+    fast, slow_y = (one.respond(hold(u))[::FINE] for one in (replace(FAST, times=(0.6,)), slow))
+    y = (1.0 - share) * fast + share * slow_y + NOISE * draw_noise(1)
+    context = build_context([make_record(u, y)], "fopdt", FAST.values)
+    texts = [one.text for one in explain_residuals(context).findings]
+    assert texts
+    assert not any("T = -" in text or "about -" in text.partition("T drifts")[2] for text in texts)
+
+
+def test_a_jump_of_a_state_acts_on_all_outputs_of_its_experiment() -> None:
+    times = STEP * np.arange(N)
+    records = [
+        Record(
+            (Channel("u", times, draw_levels(seed)),),
+            (Channel("y", times, draw_noise(seed)), Channel("z", times, draw_noise(seed + 9))),
+        )
+        for seed in (1, 2)
+    ]
+    context = build_context(records, TWO_OUTPUTS, {"a": 1.0})
+    slope = np.exp(-np.tile(times, 4))
+    shifted = context.shift_start(slope, 2 * N + 100)  # of y in experiment 2
+    expected = np.where(times >= times[100], np.exp(-(times - times[100])), 0.0)
+    for number, part in enumerate(context.parts):
+        wanted = expected if part.experiment == 1 else np.zeros(N)
+        np.testing.assert_allclose(shifted[part.rows], wanted, err_msg=str(number))

@@ -216,6 +216,17 @@ def test_a_record_that_begins_with_its_step_is_told_apart(noise: float) -> None:
     assert find_unprompted_output(_step_test(5.0, noise)) is None
 
 
+def test_noise_in_a_record_in_which_nothing_moves_is_no_move() -> None:
+    times = np.arange(120) * 0.1
+    still = Channel("u", times, np.zeros(120), hold="zero")
+    slow = np.where(times < 4.0, 0.0, 0.2) + np.random.default_rng(1).normal(0.0, 0.01, 120)
+    record = Record((still,), (Channel("y", times, slow),))
+    assert find_unprompted_output(record) is not None
+    assert find_unprompted_output(record, {"y": 4.0}) is None
+    step = _step_test(0.0, 0.02)
+    assert find_unprompted_output(step, {"y": 1.0}) == find_unprompted_output(step)
+
+
 def test_where_both_grow_from_nothing_the_output_does_not_move_alone() -> None:
     times = np.arange(4000) * 0.01
     grown = (times / 40.0) ** 2 * np.sin(5.0 * times)
