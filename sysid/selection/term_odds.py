@@ -21,8 +21,9 @@ from sysid.selection.frols import compute_bic, select_terms
 CERTAIN = 20.0 / 21.0
 """Weight of what is certain: odds of 20 : 1, strong evidence (Kass and Raftery 1995)."""
 
-LEAST_COVERAGE = 0.90
-"""Of a 95 % interval over all selections: less, and the selection errs oftener than the noise."""
+LEAST_COVERAGE = 0.70
+"""Of a 95 % interval over all selections. Of 1,147 coefficients of `benchmarks.selection` (output
+noise, seeds from 730,000), 94 % of the intervals above held the truth, and 12 of the 14 below."""
 
 _LIMIT_95 = 1.96  # standard errors
 _EXPANDED = 8  # sets one step away from which a second step is made
