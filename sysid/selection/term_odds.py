@@ -29,6 +29,7 @@ _LIMIT_95 = 1.96  # standard errors
 _EXPANDED = 8  # sets one step away from which a second step is made
 _MOST_RIVALS = 100  # sets of one size around another
 _LEAST_WEIGHT = 1e-3  # of a rival that may move a coefficient
+_MOST_NAMES = 3  # of terms in a text
 _TINY = float(np.finfo(float).tiny)
 _DEPENDENT_SHARE = 1e-12  # of a column's squares: less is rounding, the column is dependent
 
@@ -113,13 +114,20 @@ def _solve(
 
 
 def _describe(rival: frozenset[int], chosen: set[int], term: int, labels: Sequence[str]) -> str:
-    """Describe a rival as seen from one of the chosen terms."""
-    added = [labels[i] for i in sorted(rival - chosen)]
-    removed = ["it" if i == term else labels[i] for i in sorted(chosen - rival)]
+    """Describe a rival as seen from one of the chosen terms, which comes first if it is absent."""
+    added = _join([labels[i] for i in sorted(rival - chosen)])
+    absent = sorted(chosen - rival, key=lambda i: (i != term, i))
+    removed = _join(["it" if i == term else labels[i] for i in absent])
     if not added:
-        return f"without {' and '.join(removed)}"
-    instead = f"instead of {' and '.join(removed)}" if removed else "besides"
-    return f"with {' and '.join(added)} {instead}"
+        return f"without {removed}"
+    return f"with {added} instead of {removed}" if removed else f"with {added} besides"
+
+
+def _join(names: list[str]) -> str:
+    """Join at most three names, and count the others."""
+    shown = names[:_MOST_NAMES]
+    more = len(names) - len(shown)
+    return " and ".join([*shown, f"{more} more"] if more else shown)
 
 
 def _collect_rivals(
