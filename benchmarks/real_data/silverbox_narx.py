@@ -26,7 +26,7 @@ MODEL: dict[str, Any] = {
 # Each simulation has 65,062 steps, and the search would use up all of its 400 generations: nearly
 # all random coefficients diverge, so it never finds the champion again from random places.
 SEARCH = {"generations": 100}
-SELECTIONS = {"one-step": MODEL["terms"], "simulation": MODEL["terms"] | {"error": "simulation"}}
+SELECTIONS = {error: MODEL["terms"] | {"error": error} for error in ("one-step", "simulation")}
 
 
 def measure(client: Client, folder: Path) -> list[Row]:

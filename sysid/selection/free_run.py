@@ -71,6 +71,8 @@ class FreeRunSelection(NamedTuple):
     innovation_variance : float
         Their mean square, times n^(p/n): so the criterion of Bayes pays for p coefficients of the
         noise, of lags and of the start.
+    variance : float
+        Mean square of the error of the free run.
     noise_order : int
         Order of the autoregressive noise; 0: white.
     """
@@ -82,6 +84,7 @@ class FreeRunSelection(NamedTuple):
     plain_triangle: FloatArray
     samples: int
     innovation_variance: float
+    variance: float
     noise_order: int
 
 
@@ -119,7 +122,7 @@ class FreeRunSelector:
         """Select from the starts by the plain error, then from the best by the whitened one.
 
         None if no free run from there stays finite. Once only white noise is left, no other start
-        is made.
+        is made. A rule that names the error of the simulation does not whiten it.
         """
         best: FreeRunSelection | None = None
         for start in starts:
@@ -129,7 +132,7 @@ class FreeRunSelector:
         if best is not None:
             self._iterate(self._reduce_order(best), is_white=True)
             best = self._find_best()
-        if best is not None and best.noise_order:
+        if best is not None and best.noise_order and self._rule.error != "simulation":
             self._iterate(best.forward_selection.order, is_white=False)
             best = self._find_best()
         if best is not None and self._demand is not self._rule:
@@ -195,9 +198,9 @@ class FreeRunSelector:
         return min(found, key=self._rate, default=None)
 
     def _rate(self, one: FreeRunSelection) -> tuple[float, ...]:
-        share, terms = one.innovation_variance / self._power, len(one.forward_selection.order)
-        candidates = len(self._whole.model.terms)
-        return rate_terms(self._demand, share, terms, one.samples, candidates)
+        variance = one.variance if self._rule.error == "simulation" else one.innovation_variance
+        terms, candidates = len(one.forward_selection.order), len(self._whole.model.terms)
+        return rate_terms(self._demand, variance / self._power, terms, one.samples, candidates)
 
 
 def _compute_output_power(problem: Problem) -> float:
@@ -295,6 +298,7 @@ def _linearise(
         plain,
         samples,
         price * squares / samples,
+        float(np.mean(np.square(residuals))),
         noise.order,
     )
 

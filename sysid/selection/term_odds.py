@@ -21,13 +21,15 @@ from sysid.selection.frols import compute_bic, select_terms
 CERTAIN = 20.0 / 21.0
 """Weight of what is certain: odds of 20 : 1, strong evidence (Kass and Raftery 1995)."""
 
-LEAST_COVERAGE = 0.90
-"""Of a 95 % interval over all selections: less, and the selection errs oftener than the noise."""
+LEAST_COVERAGE = 0.70
+"""Of a 95 % interval over all selections. Of 1,147 coefficients of `benchmarks.selection` (output
+noise, seeds from 730,000), 94 % of the intervals above held the truth, and 12 of the 14 below."""
 
 _LIMIT_95 = 1.96  # standard errors
 _EXPANDED = 8  # sets one step away from which a second step is made
 _MOST_RIVALS = 100  # sets of one size around another
 _LEAST_WEIGHT = 1e-3  # of a rival that may move a coefficient
+_MOST_NAMES = 3  # of terms in a text
 _TINY = float(np.finfo(float).tiny)
 _DEPENDENT_SHARE = 1e-12  # of a column's squares: less is rounding, the column is dependent
 
@@ -112,13 +114,20 @@ def _solve(
 
 
 def _describe(rival: frozenset[int], chosen: set[int], term: int, labels: Sequence[str]) -> str:
-    """Describe a rival as seen from one of the chosen terms."""
-    added = [labels[i] for i in sorted(rival - chosen)]
-    removed = ["it" if i == term else labels[i] for i in sorted(chosen - rival)]
+    """Describe a rival as seen from one of the chosen terms, which comes first if it is absent."""
+    added = _join([labels[i] for i in sorted(rival - chosen)])
+    absent = sorted(chosen - rival, key=lambda i: (i != term, i))
+    removed = _join(["it" if i == term else labels[i] for i in absent])
     if not added:
-        return f"without {' and '.join(removed)}"
-    instead = f"instead of {' and '.join(removed)}" if removed else "besides"
-    return f"with {' and '.join(added)} {instead}"
+        return f"without {removed}"
+    return f"with {added} instead of {removed}" if removed else f"with {added} besides"
+
+
+def _join(names: list[str]) -> str:
+    """Join at most three names, and count the others."""
+    shown = names[:_MOST_NAMES]
+    more = len(names) - len(shown)
+    return " and ".join([*shown, f"{more} more"] if more else shown)
 
 
 def _collect_rivals(

@@ -79,7 +79,7 @@ def test_a_coefficient_that_another_term_would_move_is_not_certain() -> None:
     columns, _ = draw(3)
     columns[:, 2] = columns[:, 0] + 0.2 * columns[:, 2]
     noise = rng.standard_normal(SAMPLES)
-    target = 3.0 * columns[:, 0] + 0.55 * columns[:, 2] - columns[:, 1] + noise
+    target = 3.0 * columns[:, 0] + 0.7 * columns[:, 2] - columns[:, 1] + noise
     first, second = weigh(columns, target, [0, 1])
     assert first.probability > CERTAIN
     assert first.coverage < LEAST_COVERAGE
