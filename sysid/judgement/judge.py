@@ -194,7 +194,7 @@ def _refit_finalists(
         if found is None:
             continue
         used = (1 + one.candidate.counted) * np.log(max(context.times.size, 2))
-        gain = criterion - found.criterion - used
+        gain = float(criterion - found.criterion - used)
         if gain > one.gain - STRONG_ODDS:
             refitted[position] = one._replace(gain=max(gain, one.gain), moves=found.moves)
     parted = _part_finalist(context, scored, criterion)
@@ -216,6 +216,8 @@ def _part_finalist(
     changed = [one for one in found.changes if one[0] > UNLIKELY_MOVE][:_MOST_TOLD]
     if not changed or gain < likeliest.gain + STRONG_ODDS:
         return []
+    if likeliest.candidate.explanation == "change of a unit" and context.scales(changed[0][1]):
+        return [likeliest._replace(gain=gain, moves=found.moves)]  # both parts, in other words
     names = join_names([name for _, name, _, _ in changed])
     verb = "change" if len(changed) > 1 else "changes"
     told = ", ".join(f"{name} from {a:.4g} to {b:.4g}" for _, name, a, b in changed)

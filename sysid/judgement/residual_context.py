@@ -35,6 +35,7 @@ _SHOCKS = 3  # innovations that are looked at
 _START_SIMULATIONS, _MOST_START_SIMULATIONS = 3, 13  # of the slopes in a start
 _FULL_FIT = 20  # simulations of a full fit and its slopes, for each parameter and one
 _MOST_POWER = 50.0  # of e: a move that is no number is no move
+_SCALED_SHARE = 0.01  # of a column that a scale and an offset of the output do not explain
 _OWN_SHARE = 1e-6  # of a column that no parameter explains: less says nothing
 
 CUT_THERE = "Cut the record there into two, and identify each part by itself."
@@ -300,9 +301,11 @@ class ResidualContext:
         if not self.simulations.allow(2 * _FULL_FIT * (d + 1)):
             return None
         points, columns, residuals = [], [], np.zeros(n)
-        for is_part in (~is_late, is_late):
-            problem = self._leave_out(~is_part)
-            (end,) = refine_candidates(problem, [self.theta], _REFIT_STEPS * (d + 1))
+        for is_part, span in ((~is_late, (-np.inf, moment)), (is_late, (moment, np.inf))):
+            problem = self._select_span(*span)
+            evaluator = problem.evaluator
+            start = np.clip(self.theta, evaluator.lower, evaluator.upper)
+            (end,) = refine_candidates(problem, [start], _REFIT_STEPS * (d + 1))
             if end is None:
                 return None
             slopes = compute_sensitivities(self.problem, end.theta)
@@ -333,14 +336,35 @@ class ResidualContext:
             change = float(values[1][number] - values[0][number])
             size = abs(change) / max(float(np.hypot(*(e[number] for e in errors))), 1e-300)
             changes.append((size, name, float(values[0][number]), float(values[1][number])))
-        criterion = fit.criterion + used * np.log(max(n, 2))
+        criterion = float(fit.criterion + used * np.log(max(n, 2)))
         return Parted(criterion, _order_moves(moves), tuple(sorted(changes, reverse=True)))
 
-    def _leave_out(self, rows: BoolArray) -> Problem:
-        """Leave scored samples (n,) out of the residuals of least squares."""
-        weight = self.problem.evaluator.weight.copy()
-        weight[self.problem.scored_rows[rows]] = 0.0
-        return replace(self.problem, evaluator=self.problem.evaluator._replace(weight=weight))
+    def scales(self, name: str) -> bool:
+        """Return whether a parameter only scales or shifts what is simulated."""
+        (number,) = (d for d, one in self.declared if one == name)
+        column = self.residual_model.columns[:, number]
+        basis = self.weigh(np.column_stack([np.ones(self.times.size), self.simulated]))
+        rest = column - basis @ np.linalg.lstsq(basis, column, rcond=None)[0]
+        return bool(rest @ rest < _SCALED_SHARE * (column @ column))
+
+    def _select_span(self, begin: float, end: float) -> Problem:
+        """Compare no outputs but those from a time up to another one (s), without it."""
+        records = [
+            replace(
+                record,
+                outputs=tuple(
+                    replace(
+                        one,
+                        values=np.where(
+                            (one.times >= begin) & (one.times < end), one.values, np.nan
+                        ),
+                    )
+                    for one in record.outputs
+                ),
+            )
+            for record in self.problem.records
+        ]
+        return self.problem.rebuild(records=records, weights=self.problem.output_weights)
 
     @cached_property
     def start_slopes(self) -> list[FloatArray]:

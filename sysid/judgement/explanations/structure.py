@@ -105,8 +105,8 @@ def _list_past_inputs(context: ResidualContext) -> Iterator[FloatArray]:
     """List columns (n,) of past values of each input that moves."""
     longest = max(part.times.size for part in context.parts)
     most = context.times.size // (_SAMPLES_PER_LAG * max(len(context.moving_inputs), 1))
-    lags = np.geomspace(1.0, max(longest / 4, 1.0), min(_LAGS, max(most, 1)))
-    lags = np.unique(lags.astype(np.int64)) - 1
+    spaced = np.geomspace(1.0, max(longest / 4, 1.0), min(_LAGS, max(most, 1)))
+    lags = np.unique(spaced.astype(np.int64)) - 1
     for channel in context.moving_inputs:
         for lag in lags.tolist():
             column = context.read_input(channel.name, lag)

@@ -288,3 +288,21 @@ def test_a_jump_of_a_state_acts_on_all_outputs_of_its_experiment() -> None:
     for number, part in enumerate(context.parts):
         wanted = expected if part.experiment == 1 else np.zeros(N)
         np.testing.assert_allclose(shifted[part.rows], wanted, err_msg=str(number))
+
+
+@pytest.mark.parametrize(("before", "after"), [(1.2, 2.2), (2.2, 4.7)])
+def test_both_parts_of_a_record_are_fitted_by_themselves(before: float, after: float) -> None:
+    """The lags are far apart, so no linear step leads from one estimate of both to each."""
+    u = draw_levels(1)
+    first, second = (
+        replace(FAST, delay=delay).respond(hold(u))[::FINE] for delay in (before, after)
+    )
+    y = np.where(np.arange(N) < 240, first, second) + NOISE * draw_noise(1)
+    context = build_context([make_record(u, y)], "fopdt", FAST.values)
+    found = context.refit_parts(STEP * 240)
+    assert found is not None
+    size, name, *values = found.changes[0]
+    assert name == "L"
+    assert size > 20.0
+    assert values == pytest.approx([before, after], abs=0.1)
+    assert context.residual_model.without.criterion - found.criterion > 500.0
