@@ -341,7 +341,7 @@ class ResidualContext:
 
     def scales(self, name: str) -> bool:
         """Return whether a parameter only scales or shifts what is simulated."""
-        (number,) = (d for d, one in self.declared if one == name)
+        (number,) = (d for d, one in self.parameter_numbers if one == name)
         column = self.residual_model.columns[:, number]
         basis = self.weigh(np.column_stack([np.ones(self.times.size), self.simulated]))
         rest = column - basis @ np.linalg.lstsq(basis, column, rcond=None)[0]
