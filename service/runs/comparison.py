@@ -23,6 +23,7 @@ from sysid.core.value_documents import encode
 from sysid.results.result import Result
 from sysid.uncertainty.estimates import Estimate
 
+_NORMAL_QUANTILE = 1.96  # of a 95 % interval
 _DATA_DIFFERENCES = {
     "datasets": "other datasets",
     "outputs": "other measured channels as outputs",
@@ -223,13 +224,21 @@ def _compare_parameters(
         )
 
 
+def _find_own_interval(estimate: Estimate) -> tuple[float, float] | None:
+    """Find the 95 % interval of an estimate under its own model."""
+    if estimate.status != "dependent" or estimate.stderr is None:
+        return estimate.interval95
+    half = _NORMAL_QUANTILE * estimate.stderr
+    return estimate.value - half, estimate.value + half
+
+
 def find_furthest_pair(estimates: Sequence[Estimate]) -> tuple[int, int] | None:
-    """Find the two estimates whose 95 % intervals are furthest apart; None if all overlap."""
-    intervals = {
-        i: estimate.interval95
-        for i, estimate in enumerate(estimates)
-        if estimate.interval95 is not None and _has_ends(estimate.interval95)
-    }
+    """Find the two estimates whose 95 % intervals are furthest apart; None if all overlap.
+
+    A dependent value has the interval of its own model here, not that over other explanations.
+    """
+    own = {i: _find_own_interval(estimate) for i, estimate in enumerate(estimates)}
+    intervals = {i: ends for i, ends in own.items() if ends is not None and _has_ends(ends)}
     gaps = {
         (i, j): max(intervals[i][0], intervals[j][0]) - min(intervals[i][1], intervals[j][1])
         for i, j in combinations(intervals, 2)

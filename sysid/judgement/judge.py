@@ -74,7 +74,8 @@ class Explained(NamedTuple):
     @property
     def is_noise(self) -> bool:
         """Whether no explanation has strong odds against noise alone, or moves an estimate."""
-        return not self.is_doubtful and all(one.severity == "note" for one in self.findings)
+        is_clear = self.is_done and not self.is_doubtful
+        return is_clear and all(one.severity == "note" for one in self.findings)
 
 
 def explain_residuals(context: ResidualContext) -> Explained:
@@ -130,6 +131,8 @@ def _is_possible(context: ResidualContext) -> bool:
     error, columns = analysis.residuals_and_sensitivities
     if context.problem.model.inputs and not context.moving_inputs:
         return False  # nothing excites the plant
+    if any(part.repeats is not None for part in context.parts):
+        return False  # samples of a repeat share their noise, which is no series in time
     return bool(np.any(error)) and error.size > 2 * columns.shape[1] + 10
 
 

@@ -343,7 +343,7 @@ class ResidualContext:
         """Return whether a parameter only scales or shifts what is simulated."""
         (number,) = (d for d, one in self.parameter_numbers if one == name)
         column = self.residual_model.columns[:, number]
-        basis = self.weigh(np.column_stack([np.ones(self.times.size), self.simulated]))
+        basis = self.weigh(np.column_stack([np.ones(self.times.size), self.simulation]))
         rest = column - basis @ np.linalg.lstsq(basis, column, rcond=None)[0]
         return bool(rest @ rest < _SCALED_SHARE * (column @ column))
 

@@ -8,8 +8,8 @@ error modeling, 1999).
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.fft import irfft, rfft
 
-from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
 from sysid.judgement.residual_context import Candidate, ResidualContext
 
@@ -79,16 +79,13 @@ def _propose_dynamics(
     )
 
 
-@jit_compile
 def _filter(values: FloatArray, samples: float) -> FloatArray:
     """Filter values (n,) by a time constant of some samples; they rest at their first one."""
-    pole = np.exp(-1.0 / samples)
-    filtered = np.empty(values.size)
-    last = values[0]
-    for i in range(values.size):
-        last = pole * last + (1.0 - pole) * values[i]
-        filtered[i] = last
-    return filtered
+    n = values.size
+    length = 1 << (2 * n - 1).bit_length()
+    decay = np.exp(-np.arange(n) / samples) * -np.expm1(-1.0 / samples)
+    moved = irfft(rfft(values - values[0], length) * rfft(decay, length), length)[:n]
+    return np.asarray(moved + values[0])
 
 
 def _differentiate(context: ResidualContext) -> FloatArray:

@@ -165,10 +165,7 @@ def test_an_estimate_that_the_integration_step_has_made_is_replaced_and_told(
     [
         0.0,
         3.0,
-        pytest.param(
-            0.3,  # its mean is not quite 0.3
-            marks=pytest.mark.xfail(strict=True, reason="tells of a line through rounding first"),
-        ),
+        0.3,  # its mean is not quite 0.3
     ],
 )
 def test_a_constant_output_is_the_verdict(level: float) -> None:

@@ -101,7 +101,9 @@ def test_a_run_that_selects_terms_gives_the_bits_of_the_library_call() -> None:
     problem = ProblemSpec(model=asked, records="short", settings=FitSettings(skip=3))
     settings = GeneticAlgorithm(generations=10)
     (result,) = carry_out(InlineExecutor(), {"r": RunSpec(problem, settings, 4)}).results["r"]
-    alone = identify(parse_model(asked), RECORDS["short"], settings, seed=4, skip=3)
+    alone = identify(
+        parse_model(asked), RECORDS["short"], settings, seed=4, skip=3, compare_orders=False
+    )
     assert len(alone.selection) == 4
     assert result.selection == alone.selection
     assert bits(result) == bits(alone)
