@@ -24,6 +24,7 @@ from sysid.results.result import Result
 from sysid.uncertainty.estimates import Estimate
 
 _NORMAL_QUANTILE = 1.96  # of a 95 % interval
+_DOUBTED = ("dependent", "ambiguous", "not settled", "refuted")  # by other explanations
 _DATA_DIFFERENCES = {
     "datasets": "other datasets",
     "outputs": "other measured channels as outputs",
@@ -226,7 +227,7 @@ def _compare_parameters(
 
 def _find_own_interval(estimate: Estimate) -> tuple[float, float] | None:
     """Find the 95 % interval of an estimate under its own model."""
-    if estimate.status != "dependent" or estimate.stderr is None:
+    if estimate.status not in _DOUBTED or estimate.stderr is None:
         return estimate.interval95
     half = _NORMAL_QUANTILE * estimate.stderr
     return estimate.value - half, estimate.value + half
