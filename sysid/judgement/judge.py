@@ -44,7 +44,7 @@ _PROPOSERS = (
 )
 _COSTLY_PROPOSERS = (actuator.propose, actuator.propose_loads)
 """Each of their explanations takes a simulation: only if the residuals depend on anything."""
-_LIKELY = 0.01  # of a likelihood ratio: with some forty candidates, of which many are alike
+_LIKELY = 0.01  # of the ratio of one candidate: then the costly ones are looked at as well
 _MOST_SHARE = 0.5  # columns for a sample: with 0.8, noise gains 12 in one of 20 records of 30
 _MOST_FINDINGS = 3  # that are found beside each other
 _MOST_TOLD = 3  # moves in a sentence
@@ -145,7 +145,7 @@ def _is_of_integration(scored: _Scored) -> bool:
 
 
 def _is_likely(scored: _Scored, samples: int) -> bool:
-    """Whether a likelihood ratio test finds a candidate: at 5 % among all, or by its gain."""
+    """Whether a likelihood ratio test at 1 % finds a candidate, or its gain does."""
     columns = scored.candidate.columns.shape[1]
     used = columns + scored.candidate.counted
     ratio = scored.gain + used * np.log(samples)

@@ -238,7 +238,6 @@ def identify_within(most: int) -> Identification:
     return identify(two_lags(1), sample_plant(STIFF), tight)
 
 
-@pytest.mark.xfail(strict=True, reason="explanations are looked for beyond the budget")
 @pytest.mark.parametrize("most", [300, 800])
 def test_a_budget_that_leaves_no_finer_fit_is_kept(most: int) -> None:
     assert identify_within(most).evaluations <= most

@@ -76,9 +76,6 @@ def test_one_step_ahead_estimates_of_an_unstable_plant_are_told(seed: int) -> No
     assert "disturbances mislead the free run" in found.verdict.text
 
 
-@pytest.mark.xfail(
-    strict=True, reason="the slope of a prediction, from both sides, knows the noise of its sample"
-)
 @pytest.mark.parametrize("seed", [1, 3])
 def test_a_right_prediction_one_step_ahead_is_trustworthy(seed: int) -> None:
     ahead = identify(PLANT, run_loop(seed, 0.03), prediction="one-step")
