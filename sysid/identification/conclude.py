@@ -246,7 +246,8 @@ def _build_identification(
             *_list_notes(
                 "posterior", () if posterior is None else describe_posterior(posterior, estimates)
             ),
-        ]
+        ],
+        problem.n_scored,
     )
     analysis = replace(analysis, estimates=conclude_estimates(estimates, findings))
     declared = [parameter.name for parameter in problem.model.parameters]

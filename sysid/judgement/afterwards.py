@@ -49,7 +49,8 @@ def explain_afterwards(problem: Problem, result: Result) -> Result:
         [
             *(one for one in kept if one.gain is None),
             *select_explanations(() if has_feedback else explained.findings, compared),
-        ]
+        ],
+        problem.n_scored,
     )
     estimates = conclude_estimates(result.parameters, findings)
     declared = [parameter.name for parameter in problem.model.parameters]

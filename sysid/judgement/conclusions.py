@@ -6,7 +6,7 @@ never make a verdict milder, nor a status.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from math import exp
+from math import exp, log
 from typing import TYPE_CHECKING
 
 from sysid.core.text import join_names, plain_estimate, plain_unit
@@ -29,6 +29,7 @@ _MOST_REASONS = 2  # of an estimate, and in a verdict
 
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
 _OF_RECORD = ("constant output", "constant input")  # then nothing else says anything
+_FAILURES = ("constant", "little fit", "straight line")
 _RANKS: tuple[EstimateStatus, ...] = (
     "identified",
     "dependent",
@@ -39,22 +40,27 @@ _RANKS: tuple[EstimateStatus, ...] = (
 """Statuses that findings give, the mildest first; others come from the analysis of the data."""
 
 
-def order_findings(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+def order_findings(findings: Iterable[Finding], samples: float = 0.0) -> tuple[Finding, ...]:
     """Order findings: explanations with a clear gain, then what is severe, then notes.
 
-    Explanations of what the model leaves come before those of its noise. Within each group the
-    largest gain is first; what is not compared follows in its order.
+    Explanations of what the model leaves come before those of its noise. If the model fails, one
+    that takes less than half of the residuals' variance, of so many samples, is not why. Within
+    each group the largest gain is first; what is not compared follows in its order.
     """
+    listed = list(findings)
+    fails = any(one.severity == "serious" and one.explanation in _FAILURES for one in listed)
+    least = max(DEFECT_GAIN, log(2.0) * samples if fails else 0.0)
     return tuple(
-        sorted(findings, key=lambda one: (_find_group(one), one.gain is None, -(one.gain or 0.0)))
+        sorted(
+            listed, key=lambda one: (_find_group(one, least), one.gain is None, -(one.gain or 0.0))
+        )
     )
 
 
-def _find_group(finding: Finding) -> int:
+def _find_group(finding: Finding, least: float) -> int:
     if finding.explanation in _OF_RECORD:
         return -1
-    is_clear = finding.gain is not None and finding.gain > DEFECT_GAIN
-    if is_clear and not finding.is_of_noise:
+    if finding.gain is not None and finding.gain > least and not finding.is_of_noise:
         return 0
     return 1 + _SEVERITIES.index(finding.severity)
 

@@ -31,6 +31,7 @@ from sysid.judgement.levels import (
 )
 from sysid.judgement.residual_context import CUT_THERE, Candidate, ResidualContext
 from sysid.judgement.residual_model import ColumnFit
+from sysid.kernels.signals.past_reads import is_difference
 from sysid.results.findings import Finding, Move
 
 _PROPOSERS = (
@@ -42,7 +43,7 @@ _PROPOSERS = (
 )
 _COSTLY_PROPOSERS = (actuator.propose, actuator.propose_loads)
 """Each of their explanations takes a simulation: only if the residuals depend on anything."""
-_LIKELY = 0.01  # of a likelihood ratio: with some forty candidates, of which many are alike
+_LIKELY = 0.01  # of the ratio of one candidate: then the costly ones are looked at as well
 _BY_ORDER = ("one more time constant", "filter of a sensor")  # another order is the full fit
 _MOST_SHARE = 0.5  # columns for a sample: with 0.8, noise gains 12 in one of 20 records of 30
 _MOST_FINDINGS = 3  # that are found beside each other
@@ -131,13 +132,15 @@ def _is_possible(context: ResidualContext) -> bool:
     error, columns = analysis.residuals_and_sensitivities
     if context.problem.model.inputs and not context.moving_inputs:
         return False  # nothing excites the plant
+    if context.problem.prediction != "simulation" and is_difference(context.problem.model):
+        return False  # its first samples are predicted from an assumed past, which looks like more
     if any(part.repeats is not None for part in context.parts):
         return False  # samples of a repeat share their noise, which is no series in time
     return bool(np.any(error)) and error.size > 2 * columns.shape[1] + 10
 
 
 def _is_likely(scored: _Scored, samples: int) -> bool:
-    """Whether a likelihood ratio test finds a candidate: at 5 % among all, or by its gain."""
+    """Whether a likelihood ratio test at 1 % finds a candidate, or its gain does."""
     columns = scored.candidate.columns.shape[1]
     used = columns + scored.candidate.counted
     ratio = scored.gain + used * np.log(samples)

@@ -95,7 +95,6 @@ def find_unexplained(
             "caution",
             "the residuals are not noise",
             f"the residuals on the {tests.data} data are not white, and why was not looked for.",
-            "Identify this record by itself.",
         )
     uncertainty = analysis.uncertainty
     if uncertainty is not None and uncertainty.noise_colour in ("coloured", "drifting"):
