@@ -225,9 +225,10 @@ def _describe_finding(finding: Finding) -> dict[str, Any]:
 
 def read_advice(found: Identification) -> tuple[str, ...]:
     """Read the verdict's first advice as settings; `model=NAME` is another model."""
-    if found.verdict.trust == "trustworthy":
+    severe = [one for one in found.findings if one.severity != "note"]
+    if not severe:
         return ()
-    advice = found.findings[0].advice
+    advice = severe[0].advice
     models = re.findall(r"the model (\w+)", advice)
     typed = rewrite_settings(advice, _write_options)
     return (*(f"model={name}" for name in models), *read_settings(typed))

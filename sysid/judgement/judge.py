@@ -252,6 +252,7 @@ def _describe(
     for rival in rivals:
         would = rival.moves or context.compute_moves(rival.fit, before, rival.candidate.varies)
         notable |= _list_notable(would)
+    notable |= set(candidate.doubtful)
     parameters = tuple(dict.fromkeys(m.parameter for m in moves if m.parameter in notable))
     if candidate.is_vague or _is_large(context, best):
         parameters = context.problem.free_names

@@ -203,8 +203,20 @@ def find_other_orders(
             for fit in sorted(moved, key=lambda fit: fit.bic)
             if estimate.stderr
         ),
-        (name,) if moved else (),
+        (name, *_list_moved(best, estimates, name)) if moved else (),
     )
+
+
+def _list_moved(best: OrderFit, estimates: Sequence[Estimate], delay: str) -> list[str]:
+    """List the other parameters that both models have and that the better one moves."""
+    return [
+        one.name
+        for one in estimates
+        if one.name in best.values
+        and one.name != delay
+        and one.stderr
+        and abs(best.values[one.name] - one.value) > SEPARABLE * one.stderr
+    ]
 
 
 def _is_moved(fit: OrderFit, own: OrderFit) -> bool:

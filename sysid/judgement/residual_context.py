@@ -1,6 +1,6 @@
 """What explanations of residuals start from: residuals, sensitivities, and the model itself."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -63,6 +63,9 @@ class Candidate:
         Where something changes, s.
     records : sequence of Record, or None
         Records with which the model is fitted again, for moves that are not linear.
+    doubtful : collection of str
+        Parameters that take its place in the model, whatever the step to it: a time lag that of
+        missing parts, and of clocks.
     is_vague : bool
         Whether it leaves open what the model lacks: then no parameter is safe.
     is_added : bool
@@ -80,6 +83,7 @@ class Candidate:
     varies: tuple[int, float, float] | None = None
     moment: float | None = None
     records: Sequence[Record] | None = None
+    doubtful: Collection[str] = ()
     is_vague: bool = False
     is_added: bool = False
 

@@ -191,8 +191,10 @@ def find_open_starts(
             "caution",
             f"the states may start {_NAMES[fit.name]}",
             f"the estimates assume that the states start {_NAMES[own.name]}. The data do not rule "
-            f"out that they start {_NAMES[fit.name]}. Then {', '.join(told[:_MOST_TOLD])}.",
-            f"Use initial: {fit.name} for that." if fit.name else "",
+            f"out that they start {_NAMES[fit.name]}"
+            f"{f' (initial: {fit.name})' if fit.name else ''}. Then "
+            f"{', '.join(told[:_MOST_TOLD])}.",
+            "",
             own.bic - fit.bic,
             moves,
             notable,

@@ -80,6 +80,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 f"Look for lost rows there. {CUT_THERE}",
                 counted=1,
                 moment=at,
+                doubtful=context.delays,
             )
         yield Candidate(
             "drift of a clock",
@@ -88,6 +89,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             "the clocks drift apart",
             "the clocks of input and output drift apart",
             "Put both channels on one clock.",
+            doubtful=context.delays,
         )
 
 

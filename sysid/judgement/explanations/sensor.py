@@ -175,6 +175,7 @@ def _propose_old_readings(
                 f"{name} is a mean of about {samples} samples, or is filtered before it is stored",
                 "",
                 counted=1,
+                doubtful=context.delays,
             )
 
 

@@ -68,7 +68,7 @@ def test_an_open_start_that_moves_an_estimate_is_found() -> None:
     estimates = analyse_estimate(rested.own.problem, rested.own.theta).estimates
     [found] = find_open_starts(replace(rested, fits=(rested.own, free)), estimates)
     assert found.severity == "caution"
-    assert found.advice == "Use initial: free for that."
+    assert "(initial: free)" in found.text
     assert set(found.parameters) <= {"K", "T", "L", "y0"}
     assert found.gain == pytest.approx(rested.own.bic - free.bic)
     assert abs(found.moves[0].stderrs) > 1.0
