@@ -30,7 +30,7 @@ from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
 from sysid.judgement.judge import explain_residuals
-from sysid.judgement.levels import SEPARABLE
+from sysid.judgement.levels import SEPARABLE, UNLIKELY_MOVE
 from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
 from sysid.models.catalogue.load import load_model
 from sysid.models.catalogue.process_family import Process, ProcessEntry, list_neighbouring_orders
@@ -215,7 +215,7 @@ def _list_moved(best: OrderFit, estimates: Sequence[Estimate], delay: str) -> li
         if one.name in best.values
         and one.name != delay
         and one.stderr
-        and abs(best.values[one.name] - one.value) > SEPARABLE * one.stderr
+        and abs(best.values[one.name] - one.value) > UNLIKELY_MOVE * one.stderr
     ]
 
 
