@@ -288,6 +288,8 @@ def collect_minima(
     Least squares ends anywhere in a flat valley. So an end that the data do not rule out belongs to
     the lowest one if the linear model at the estimate says so too.
     """
+    if not fits:
+        return ()
     n = problem.n_scored * _get_variance_ratio(linear)
     ordered = sorted(fits, key=lambda fit: fit.rms)
     units = to_unit(problem.evaluator, np.array([fit.theta for fit in ordered]))

@@ -82,11 +82,12 @@ def find_profile_ends(
         return FoundEnds({}, 1)
     search = _EndSearch(problem, theta, analysis, model, max_simulations - 1)
     ends = {}
-    for d in search.select_doubtful(estimates, uncertainty.correlation):
-        name = problem.free_names[d]
-        found = search.find_ends(d) if names is None or name in names else None
-        if found is not None:
-            ends[name] = found
+    with np.errstate(over="ignore", invalid="ignore"):  # far away a simulation may diverge
+        for d in search.select_doubtful(estimates, uncertainty.correlation):
+            name = problem.free_names[d]
+            found = search.find_ends(d) if names is None or name in names else None
+            if found is not None:
+                ends[name] = found
     return FoundEnds(ends, 1 + search.evaluations)
 
 

@@ -281,6 +281,7 @@ def test_equal_ends_are_one_minimum_and_ratios_are_of_likelihoods() -> None:
         np.eye(4), 1e3 * np.eye(4), np.zeros(4), 300 * 0.02**2, np.full(4, 0.1)
     )
     assert collect_minima(problem, ends, sharp)[1].is_compatible
+    assert collect_minima(problem, []) == ()  # no end reads recorded input only
 
 
 def test_ends_in_one_flat_valley_are_one_minimum() -> None:
