@@ -154,9 +154,15 @@ def _list_candidates(
         for candidate in propose(context):
             columns = candidate.columns
             used = context.theta.size + columns.shape[1]
-            is_fit = used <= _MOST_SHARE * context.times.size and np.all(np.isfinite(columns))
-            if is_fit and columns.any():
+            if used <= _MOST_SHARE * context.times.size and _have_lengths(columns):
                 yield candidate
+
+
+def _have_lengths(columns: FloatArray) -> bool:
+    """Whether each column (n, q) has a length: that of a run that diverges is no number."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        lengths = np.linalg.norm(columns, axis=0)
+    return bool(np.all(np.isfinite(lengths)) and lengths.any())
 
 
 def _score(
@@ -309,7 +315,7 @@ def select_explanations(
     Each of them was compared with the model alone, so they compete. Those with strong evidence
     against them, beside the likeliest one, are left out. What was found beside the likeliest one
     stays with it. Another order that was fitted in full takes the place of its columns.
-    stays with it. Explanations of the noise compete with none of them, and always stay.
+    Explanations of the noise compete with none of them, and always stay.
     """
     if any(one.explanation == "order" and (one.gain or 0.0) > DEFECT_GAIN for one in refitted):
         explained = [one for one in explained if one.explanation not in _BY_ORDER]

@@ -1,5 +1,6 @@
 """The judge: the likeliest explanations, one beside the other, on one scale."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -7,10 +8,11 @@ import pytest
 
 from sysid.core.settings import Loss
 from sysid.data.records import Channel, Record
+from sysid.judgement import judge
 from sysid.judgement.conclusions import order_findings
 from sysid.judgement.judge import Explained, explain_residuals, select_explanations
 from sysid.judgement.levels import DEFECT_GAIN, STRONG_ODDS
-from sysid.judgement.residual_context import ResidualContext, Simulations
+from sysid.judgement.residual_context import Candidate, ResidualContext, Simulations
 from sysid.models.parse import parse_model
 from sysid.results.findings import Finding, note
 from sysid.uncertainty.analysis import analyse_estimate
@@ -119,6 +121,17 @@ def test_no_more_simulations_are_taken_than_are_allowed(most: int) -> None:
     assert not explained.is_done
     assert not explained.is_noise
     assert explain_residuals(whole).is_done
+
+
+@pytest.mark.parametrize("size", [1e200, np.inf, np.nan])
+def test_a_run_that_diverges_explains_nothing(size: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    def propose_diverged(context: ResidualContext) -> Iterator[Candidate]:
+        columns = size * context.weigh(draw_levels(1))
+        yield Candidate("curve of an actuator", "actuator", columns, "a curve", "a curve")
+
+    expected = explain_line(LATE)
+    monkeypatch.setattr(judge, "_PROPOSERS", (*judge._PROPOSERS, propose_diverged))
+    assert explain_line(LATE) == expected
 
 
 def test_nothing_is_simulated_after_the_time_limit() -> None:
