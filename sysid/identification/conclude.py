@@ -38,7 +38,7 @@ from sysid.judgement.input_hold import (
 )
 from sysid.judgement.integration_step import find_finer_step
 from sysid.judgement.judge import select_explanations
-from sysid.judgement.levels import SOLVER_SHARE
+from sysid.judgement.levels import SOLVER_SHARE, STRONG_ODDS
 from sysid.judgement.noise_findings import find_feedback, find_noise_model, find_unexplained
 from sysid.judgement.open_terms import find_open_terms
 from sysid.judgement.preparation import (
@@ -185,9 +185,18 @@ def _build_identification(
         run_residual_tests(problem, simulated, "estimation") if any(times.values()) else tests,
     )
     is_white = analysis.uncertainty is None or analysis.uncertainty.noise_colour == "white"
-    measures = compares_orders and not is_white  # beside white residuals nothing is better
+    # Beside white residuals nothing is better, and in a loop the controller's inverse is.
+    measures = compares_orders and not is_white and not feedback
     yardstick = fit_yardstick(problem, simulated) if measures else None
     is_of_the_solver = metrics.rms <= SOLVER_SHARE * problem.output_scale
+    explanations = select_explanations(
+        () if is_of_the_solver or feedback else explained.findings,
+        [
+            *find_other_orders(orders, problem.model.name, estimates),
+            *find_other_readings(problem, holds, doubts, estimates, rms),
+            *find_open_starts(best.starts, estimates),
+        ],
+    )
     findings = order_findings(
         [
             *find_disagreement(metrics, limit, are_residuals_noise=are_noise),
@@ -195,21 +204,14 @@ def _build_identification(
             *find_better_yardstick(
                 yardstick,
                 [one.name for one in estimates if one.is_free],
-                is_explained=any(one.gain for one in explained.findings),
+                is_explained=any(map(_is_clear_doubt, explanations)),
             ),
             *find_unsettled(
                 evidence, estimates, lambda: find_cause_in_bounds(problem, theta, analysis)
             ),
             *find_contradictions(problem, metrics, validated, estimates),
             *find_misled_run(estimates, ahead),
-            *select_explanations(
-                () if is_of_the_solver or feedback else explained.findings,
-                [
-                    *find_other_orders(orders, problem.model.name, estimates),
-                    *find_other_readings(problem, holds, doubts, estimates, rms),
-                    *find_open_starts(best.starts, estimates),
-                ],
-            ),
+            *explanations,
             *find_ambiguous(estimates),
             *find_open_terms(estimates, problem.model),
             *find_undetermined(problem, analysis, delays, are_residuals_noise=are_noise),
@@ -330,6 +332,10 @@ def _compute_input_history(problem: Problem) -> tuple[float, ...]:
         record.history_duration + max(start - record.start, 0.0)
         for record, start in zip(problem.records, scored_from, strict=True)
     )
+
+
+def _is_clear_doubt(finding: Finding) -> bool:
+    return finding.severity != "note" and (finding.gain or 0.0) > STRONG_ODDS
 
 
 def _list_notes(explanation: str, texts: Iterable[str]) -> list[Finding]:

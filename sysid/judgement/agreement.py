@@ -61,8 +61,8 @@ def find_better_yardstick(
 ) -> Iterator[Finding]:
     """Find a linear black box that predicts left-out blocks clearly better than the model.
 
-    It says that the model fails, not why. So beside an explanation (`is_explained`) it is a note
-    without advice: that of the explanation helps.
+    It says that the model fails, not why. So beside a clear cause of doubt (`is_explained`) it is a
+    note without advice: that of the cause helps. What moves no estimate is none.
     """
     if yardstick is None or not yardstick.is_clearly_better:
         return
