@@ -38,7 +38,7 @@ from sysid.judgement.input_hold import (
 )
 from sysid.judgement.integration_step import find_finer_step
 from sysid.judgement.judge import select_explanations
-from sysid.judgement.levels import SOLVER_SHARE, STRONG_ODDS
+from sysid.judgement.levels import SOLVER_SHARE
 from sysid.judgement.noise_findings import find_feedback, find_noise_model, find_unexplained
 from sysid.judgement.open_terms import find_open_terms
 from sysid.judgement.preparation import (
@@ -204,7 +204,7 @@ def _build_identification(
             *find_better_yardstick(
                 yardstick,
                 [one.name for one in estimates if one.is_free],
-                is_explained=any(map(_is_clear_doubt, explanations)),
+                explanations,
             ),
             *find_unsettled(
                 evidence, estimates, lambda: find_cause_in_bounds(problem, theta, analysis)
@@ -332,10 +332,6 @@ def _compute_input_history(problem: Problem) -> tuple[float, ...]:
         record.history_duration + max(start - record.start, 0.0)
         for record, start in zip(problem.records, scored_from, strict=True)
     )
-
-
-def _is_clear_doubt(finding: Finding) -> bool:
-    return finding.severity != "note" and (finding.gain or 0.0) > STRONG_ODDS
 
 
 def _list_notes(explanation: str, texts: Iterable[str]) -> list[Finding]:
