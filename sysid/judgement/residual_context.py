@@ -1,6 +1,6 @@
 """What explanations of residuals start from: residuals, sensitivities, and the model itself."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -13,14 +13,14 @@ from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.core.units import format_unit
 from sysid.data.holds import Hold
 from sysid.data.interpolation import interpolate_channel
-from sysid.data.records import Channel, Record
+from sysid.data.records import Channel, Record, keep_outputs
 from sysid.judgement.residual_model import ColumnFit, OutputNoise, ResidualModel
 from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.kernels.signals.past_reads import is_difference, list_delayed_values
 from sysid.models.model import MAX_SUBSTEPS, Model, replace_substeps
 from sysid.models.ties import collect_parameter_names
 from sysid.residuals.series import ResidualPart, iterate_parts
-from sysid.results.findings import Family, Move
+from sysid.results.findings import Family, Move, list_moves, order_moves
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale
@@ -238,7 +238,7 @@ class ResidualContext:
             change = float(fit.coefficients[-1] * scale[number])
             ends[number] = [float(moved[number]) + share * change for share in shares]
         known = {estimate.name: estimate for estimate in self.analysis.estimates}
-        return _order_moves(
+        return order_moves(
             Move(
                 name,
                 self.move_value(number, end),
@@ -279,16 +279,12 @@ class ResidualContext:
         fit = ResidualModel(-sensitivities.residuals, sensitivities.columns, self.parts).without
         scale = compute_physical_scale(problem, end.theta)
         values = end.theta + fit.coefficients * scale
-        known = {estimate.name: estimate for estimate in self.analysis.estimates}
-        moves = _order_moves(
-            Move(
-                name,
-                float(values[number]),
-                float(fit.errors[number] * scale[number]),
-                float(values[number] - self.theta[number]) / stderr,
-            )
-            for number, name in self.parameter_numbers
-            if (stderr := known[name].stderr)
+        numbers = {name: number for number, name in self.parameter_numbers}
+        moves = list_moves(
+            self.analysis.estimates,
+            {name: float(values[number]) for name, number in numbers.items()},
+            {name: float(fit.errors[number] * scale[number]) for name, number in numbers.items()},
+            {name: float(self.theta[number]) for name, number in numbers.items()},
         )
         return Refitted(fit.criterion, moves)
 
@@ -341,7 +337,7 @@ class ResidualContext:
             size = abs(change) / max(float(np.hypot(*(e[number] for e in errors))), 1e-300)
             changes.append((size, name, float(values[0][number]), float(values[1][number])))
         criterion = float(fit.criterion + used * np.log(max(n, 2)))
-        return Parted(criterion, _order_moves(moves), tuple(sorted(changes, reverse=True)))
+        return Parted(criterion, order_moves(moves), tuple(sorted(changes, reverse=True)))
 
     def scales(self, name: str) -> bool:
         """Return whether a parameter only scales or shifts what is simulated."""
@@ -353,21 +349,9 @@ class ResidualContext:
 
     def _select_span(self, begin: float, end: float) -> Problem:
         """Compare no outputs but those from a time up to another one (s), without it."""
-        records = [
-            replace(
-                record,
-                outputs=tuple(
-                    replace(
-                        one,
-                        values=np.where(
-                            (one.times >= begin) & (one.times < end), one.values, np.nan
-                        ),
-                    )
-                    for one in record.outputs
-                ),
-            )
-            for record in self.problem.records
-        ]
+        records = keep_outputs(
+            self.problem.records, lambda one: (one.times >= begin) & (one.times < end)
+        )
         return self.problem.rebuild(records=records, weights=self.problem.output_weights)
 
     @cached_property
@@ -601,10 +585,6 @@ class Parted(NamedTuple):
     criterion: float
     moves: tuple[Move, ...]
     changes: tuple[tuple[float, str, float, float], ...]
-
-
-def _order_moves(moves: Iterable[Move]) -> tuple[Move, ...]:
-    return tuple(sorted(moves, key=lambda move: -abs(move.stderrs)))
 
 
 def find_delay_parameters(problem: Problem) -> set[str]:
