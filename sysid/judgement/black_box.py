@@ -214,10 +214,11 @@ class _Section(NamedTuple):
         """Compute impulse responses (n, …) of its n states after so many steps; 0 before."""
         after = np.exp(self.place[1]) * np.maximum(since, 0.0)
         if self.order == 1:
-            return np.exp(-after)[None]
+            return np.asarray(np.exp(-after)[None])
         damping = np.exp(self.place[2])
         angle = np.sqrt(1.0 - damping**2) * after
-        return np.exp(-damping * after) * np.stack([np.cos(angle), np.sin(angle)])
+        waves = np.stack([np.cos(angle), np.sin(angle)])
+        return np.asarray(np.exp(-damping * after) * waves)
 
     def simulate(self, grid: _Grid) -> FloatArray:
         """Simulate its states on the grid, (n, E, G), from rest and without delay."""
@@ -251,7 +252,7 @@ def _tell_apart(grid: _Grid, rows: _Rows) -> FloatArray:
     return np.equal.outer(np.arange(grid.inputs.shape[1]), rows.experiment).astype(np.float64)
 
 
-class _Fit(NamedTuple):
+class _FittedSections(NamedTuple):
     """Sections with their columns (R, P), linear coefficients (P,) and weighted errors (R,)."""
 
     sections: list[_Section]
@@ -269,12 +270,12 @@ def _read_columns(grid: _Grid, sections: Sequence[_Section], rows: _Rows) -> Flo
     return np.vstack([_tell_apart(grid, rows), *(one.read(grid, rows) for one in sections)]).T
 
 
-def _fit(grid: _Grid, rows: _Rows, sections: list[_Section]) -> _Fit:
+def _fit_linear(grid: _Grid, rows: _Rows, sections: list[_Section]) -> _FittedSections:
     """Fit all that is linear."""
     columns, root = _read_columns(grid, sections, rows), np.sqrt(rows.weight)
     weighted = root[:, None] * columns
     linear = _invert(weighted.T @ weighted) @ (weighted.T @ (root * rows.value))
-    return _Fit(sections, columns, linear, root * (rows.value - columns @ linear))
+    return _FittedSections(sections, columns, linear, root * (rows.value - columns @ linear))
 
 
 def _invert(gram: FloatArray) -> FloatArray:
@@ -284,7 +285,7 @@ def _invert(gram: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(scaled) / np.outer(size, size))
 
 
-def _add_slopes(grid: _Grid, fit: _Fit, rows: _Rows, columns: FloatArray) -> FloatArray:
+def _add_slopes(grid: _Grid, fit: _FittedSections, rows: _Rows, columns: FloatArray) -> FloatArray:
     """Add to the columns (R, P) of a fit its slopes over the places of all sections."""
     slopes, begin = [], grid.inputs.shape[1]
     for one in fit.sections:
@@ -296,9 +297,9 @@ def _add_slopes(grid: _Grid, fit: _Fit, rows: _Rows, columns: FloatArray) -> Flo
     return np.column_stack([columns, *slopes])
 
 
-def _refine(grid: _Grid, rows: _Rows, sections: list[_Section]) -> _Fit:
+def _refine(grid: _Grid, rows: _Rows, sections: list[_Section]) -> _FittedSections:
     """Move the sections by Gauss–Newton steps, damped (Levenberg 1944, Marquardt 1963)."""
-    fit, damping = _fit(grid, rows, sections), 1e-2
+    fit, damping = _fit_linear(grid, rows, sections), 1e-2
     ends = np.cumsum([one.place.size for one in sections])
     for _ in range(_STEPS):
         columns = np.sqrt(rows.weight)[:, None] * _add_slopes(grid, fit, rows, fit.columns)
@@ -306,7 +307,7 @@ def _refine(grid: _Grid, rows: _Rows, sections: list[_Section]) -> _Fit:
         gram[count:, count:] += damping * np.diag(gram.diagonal()[count:])
         steps = np.split((_invert(gram) @ (columns.T @ fit.errors))[count:], ends[:-1])
         moved = [one.move(grid, step) for one, step in zip(fit.sections, steps, strict=True)]
-        trial = _fit(grid, rows, moved)
+        trial = _fit_linear(grid, rows, moved)
         if trial.squares >= fit.squares:
             damping *= 10.0
             continue
@@ -317,7 +318,7 @@ def _refine(grid: _Grid, rows: _Rows, sections: list[_Section]) -> _Fit:
     return fit
 
 
-def _leave_out(grid: _Grid, fit: _Fit, rows: _Rows, every: _Rows) -> FloatArray:
+def _leave_out(grid: _Grid, fit: _FittedSections, rows: _Rows, every: _Rows) -> FloatArray:
     """Simulate each block of all samples, linearly in all parameters; nan elsewhere.
 
     The mean variance of what is simulated, over that of the noise, is the mean diagonal of
@@ -383,8 +384,7 @@ def _find_section(
         left = max(squares - float(explained[delay]), 1e-12 * squares)
         cost = rows.value.size * log(left) + 2 * shape.order * log(rows.value.size)
         if cost < least:
-            place = np.array([delay, *shape.place[1:]], dtype=np.float64)
-            best, least = shape._replace(place=place), cost
+            best, least = _Section(shape.channel, np.array([delay, *shape.place[1:]])), cost
     return best
 
 
