@@ -1,6 +1,6 @@
 """What explanations of residuals start from: residuals, sensitivities, and the model itself."""
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from sysid.kernels.signals.past_reads import is_difference, list_delayed_values
 from sysid.models.model import MAX_SUBSTEPS, Model, replace_substeps
 from sysid.models.ties import collect_parameter_names
 from sysid.residuals.series import ResidualPart, iterate_parts
-from sysid.results.findings import Family, Move, list_moves, order_moves
+from sysid.results.findings import Family, Move
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale
@@ -195,11 +195,8 @@ class ResidualContext:
         steps = _FINER * model.solver.substeps
         if is_difference(model) or steps > MAX_SUBSTEPS:
             return nothing
-        try:
-            added = self.simulate(model=replace_substeps(model, steps)) - self.simulation
-        except SysidError:
-            return nothing
-        return self.weight * added if np.all(np.isfinite(added)) else nothing
+        added = self.compute_effect(model=replace_substeps(model, steps))
+        return nothing if added is None else self.weight * added
 
     @cached_property
     def parameter_numbers(self) -> list[tuple[int, str]]:
@@ -238,7 +235,7 @@ class ResidualContext:
             change = float(fit.coefficients[-1] * scale[number])
             ends[number] = [float(moved[number]) + share * change for share in shares]
         known = {estimate.name: estimate for estimate in self.analysis.estimates}
-        return order_moves(
+        return _order_moves(
             Move(
                 name,
                 self.move_value(number, end),
@@ -279,12 +276,16 @@ class ResidualContext:
         fit = ResidualModel(-sensitivities.residuals, sensitivities.columns, self.parts).without
         scale = compute_physical_scale(problem, end.theta)
         values = end.theta + fit.coefficients * scale
-        numbers = {name: number for number, name in self.parameter_numbers}
-        moves = list_moves(
-            self.analysis.estimates,
-            {name: float(values[number]) for name, number in numbers.items()},
-            {name: float(fit.errors[number] * scale[number]) for name, number in numbers.items()},
-            {name: float(self.theta[number]) for name, number in numbers.items()},
+        known = {estimate.name: estimate for estimate in self.analysis.estimates}
+        moves = _order_moves(
+            Move(
+                name,
+                float(values[number]),
+                float(fit.errors[number] * scale[number]),
+                float(values[number] - self.theta[number]) / stderr,
+            )
+            for number, name in self.parameter_numbers
+            if (stderr := known[name].stderr)
         )
         return Refitted(fit.criterion, moves)
 
@@ -337,7 +338,7 @@ class ResidualContext:
             size = abs(change) / max(float(np.hypot(*(e[number] for e in errors))), 1e-300)
             changes.append((size, name, float(values[0][number]), float(values[1][number])))
         criterion = float(fit.criterion + used * np.log(max(n, 2)))
-        return Parted(criterion, order_moves(moves), tuple(sorted(changes, reverse=True)))
+        return Parted(criterion, _order_moves(moves), tuple(sorted(changes, reverse=True)))
 
     def scales(self, name: str) -> bool:
         """Return whether a parameter only scales or shifts what is simulated."""
@@ -386,6 +387,19 @@ class ResidualContext:
         """
         weights = self.problem.output_weights
         return self._predict(self.problem.rebuild(records=records, model=model, weights=weights))
+
+    def compute_effect(
+        self, records: Sequence[Record] | None = None, model: Model | None = None
+    ) -> FloatArray | None:
+        """Compute what other inputs or another model add to the simulated values (n,).
+
+        None if that is nothing, no number, or not to be simulated.
+        """
+        try:
+            added = self.simulate(records, model) - self.simulation
+        except SysidError:
+            return None
+        return added if np.all(np.isfinite(added)) and added.any() else None
 
     def replace_input(
         self, name: str, change: Callable[[FloatArray], FloatArray], hold: Hold | None = None
@@ -553,11 +567,6 @@ class ResidualContext:
         values = problem.predict(self.theta[None])[0][problem.scored_rows]
         return np.asarray(values)
 
-    def name_part(self, part: ResidualPart) -> str:
-        """Name an output of an experiment."""
-        several = len(self.problem.records) > 1
-        return f"{part.output} of experiment {part.experiment + 1}" if several else part.output
-
     def iterate_outputs(self) -> Iterator[tuple[str, BoolArray, str]]:
         """Iterate over the outputs: name, rows (n,), unit."""
         for output in self.problem.model.outputs:
@@ -585,6 +594,10 @@ class Parted(NamedTuple):
     criterion: float
     moves: tuple[Move, ...]
     changes: tuple[tuple[float, str, float, float], ...]
+
+
+def _order_moves(moves: Iterable[Move]) -> tuple[Move, ...]:
+    return tuple(sorted(moves, key=lambda move: -abs(move.stderrs)))
 
 
 def find_delay_parameters(problem: Problem) -> set[str]:

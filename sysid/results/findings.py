@@ -6,7 +6,7 @@ parameter. Statuses, verdict and warnings follow from the findings in one place,
 `sysid.judgement.conclusions`.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -124,11 +124,6 @@ def note(explanation: str, family: Family, text: str) -> Finding:
     return Finding(explanation, family, "note", explanation, text)
 
 
-def order_moves(moves: Iterable[Move]) -> tuple[Move, ...]:
-    """Order moves, the furthest first."""
-    return tuple(sorted(moves, key=lambda move: -abs(move.stderrs)))
-
-
 def list_moves(
     estimates: Sequence[Estimate],
     values: Mapping[str, float],
@@ -146,11 +141,12 @@ def list_moves(
     (Move(parameter='L', value=6.5, stderr=None, stderrs=3.0),)
     """
     own = {one.name: one.value for one in estimates} if own is None else own
-    return order_moves(
+    moves = [
         Move(name, values[name], stderrs.get(name), (values[name] - own[name]) / one.stderr)
         for one in estimates
         if (name := one.name) in values and name in own and one.stderr
-    )
+    ]
+    return tuple(sorted(moves, key=lambda move: -abs(move.stderrs)))
 
 
 def list_untold_reasons(estimates: Sequence[Estimate], findings: Sequence[Finding]) -> list[str]:

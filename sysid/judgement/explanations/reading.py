@@ -43,12 +43,8 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             if change is _keep and hold == channel.effective_hold:
                 continue
             records = context.replace_input(name, change, hold=hold)
-            try:
-                other = context.simulate(records)
-            except SysidError:
-                continue
-            moved = other - context.simulation
-            if np.all(np.isfinite(moved)) and moved.any():
+            moved = context.compute_effect(records)
+            if moved is not None:
                 is_sure = change is _keep and channel.sampling.is_regular
                 setting = f"Use hold: {{{name}: {hold}}}." if is_sure else ""
                 yield Candidate(
