@@ -559,7 +559,7 @@ class Recording:
     def to_record(
         self, inputs: Mapping[str, str], outputs: Mapping[str, str], name: str = ""
     ) -> "Record":
-        """Return the recording as one experiment of a model.
+        """Return the recording as one experiment of a model, with the other channels beside it.
 
         Parameters
         ----------
@@ -589,6 +589,7 @@ class Recording:
                 for role, name_in_recording in outputs.items()
             ),
             name,
+            tuple(c for c in self.channels if c.name not in {*inputs.values(), *outputs.values()}),
         )
 
     def to_records(
@@ -687,6 +688,14 @@ class Record:
     polars. If the times are dates, all channels are in seconds from the first date of any of them,
     their `started_at`. Channels usually have the names of the model's signals.
 
+    Attributes
+    ----------
+    inputs, outputs : tuple of Channel
+    name : str
+    others : tuple of Channel
+        What was recorded beside them, on the same clock. No simulation reads it, and a part of a
+        record keeps all of it. Explanations of residuals look there for another input.
+
     Examples
     --------
     >>> t = [0.0, 0.1, 0.2, 0.3]
@@ -699,10 +708,17 @@ class Record:
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
     name: str = ""
+    others: tuple[Channel, ...] = ()
 
     if TYPE_CHECKING:
 
-        def __init__(self, inputs: Channels, outputs: Channels, name: str = "") -> None: ...
+        def __init__(
+            self,
+            inputs: Channels,
+            outputs: Channels,
+            name: str = "",
+            others: tuple[Channel, ...] = (),
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         sides = [(self.inputs, "the input side"), (self.outputs, "the output side")]

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from math import isfinite
 from numbers import Real
 from os import PathLike
@@ -9,6 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from sysid.core.errors import InvalidRecord, InvalidSettings, join_pointer, suggest_name
 from sysid.data.foreign_tables import (
+    Column,
     Labelled,
     describe_object,
     is_labelled,
@@ -141,13 +143,24 @@ def _read_one(
         plain = {key: by_label.get(str(name), name) for key, name in (channels or {}).items()}
         assigned = assign_channels(model, [column.name for column in columns], plain)
         used = set(assigned.by_signal.values())
-        recording = Recording(tuple(to_channel(c) for c in columns if c.name in used))
+        others = _read_others([column for column in columns if column.name not in used])
+        recording = Recording((*(to_channel(c) for c in columns if c.name in used), *others))
     else:
         raise InvalidRecord(_describe_wrong_data(data))
     inputs = {signal.name: assigned.by_signal[signal.name] for signal in model.inputs}
     outputs = {output.name: assigned.by_signal[output.name] for output in model.outputs}
     for record in recording.to_records(inputs, outputs):
         yield record, assigned
+
+
+def _read_others(columns: Sequence[Column]) -> Iterator[Channel]:
+    """Read columns that the model does not use; those without numbers are left out."""
+    for column in columns:
+        times, start = column.axis
+        with suppress(InvalidRecord):
+            channel = Channel(column.name, times, column.values, column.unit, started_at=start)
+            if find_infinite_value([channel]) is None:
+                yield channel
 
 
 def _describe_wrong_data(data: object) -> str:

@@ -13,6 +13,7 @@ from sysid.judgement.explanations import (
     actuator,
     constancy,
     history,
+    other_input,
     reading,
     sensor,
     structure,
@@ -40,6 +41,7 @@ _PROPOSERS = (
     structure.propose,
     history.propose,
     reading.propose,
+    other_input.propose,
 )
 _COSTLY_PROPOSERS = (actuator.propose, actuator.propose_loads)
 """Each of their explanations takes a simulation: only if the residuals depend on anything."""

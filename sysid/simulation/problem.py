@@ -55,7 +55,8 @@ class Problem:
     """Fitness and predictions of candidates, J = √(Σ w²(y - ŷ)² / n) (Eq. 10).
 
     Create it with `Problem.build` or `Problem.from_settings`. Pickling sends the arguments of its
-    construction, because the address of compiled code is valid in one process only.
+    construction, because the address of compiled code is valid in one process only. What records
+    have beside the model's signals is not sent: a search does not read it.
 
     Attributes
     ----------
@@ -228,7 +229,8 @@ class Problem:
     def __reduce__(self) -> _ReduceResult:
         if self.simulates_only:
             return build_simulation_problem, (self.given_model, self.records[0])
-        return Problem.from_settings, (self.given_model, self.records, self.settings)
+        records = tuple(replace(record, others=()) for record in self.records)
+        return Problem.from_settings, (self.given_model, records, self.settings)
 
     def share(self, key: str, compute: Callable[[], _Value]) -> _Value:
         """Return what does not depend on the values of the outputs, computed once for a sweep.

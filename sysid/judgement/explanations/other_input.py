@@ -1,0 +1,235 @@
+"""Another input: a recorded channel that the model does not use acts on the output.
+
+It acts after a lag and through a part of the first order, beside the plant, or at the plant's
+input and through the plant. Each lag and time constant is a column, of which the likeliest counts.
+
+A channel is an input only if its past tells of the residuals what their own past, the inputs and
+the simulated output do not (causality: Granger, Econometrica 37 (1969) 424). So the output in
+another unit, a clock, or the set point of a loop is none. A second sensor has noise of its own, and
+may tell more. But it follows the output, and what the output drives is no input.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.fft import irfft, rfft
+
+from sysid.core.errors import SysidError
+from sysid.core.types import FloatArray
+from sysid.judgement.levels import DEFECT_GAIN, STRONG_ODDS
+from sysid.judgement.residual_context import (
+    Candidate,
+    ResidualContext,
+    interpolate_known,
+    read_channel,
+)
+from sysid.judgement.unrecorded_input import compute_reach
+from sysid.kernels.signals.past_reads import is_difference
+
+_LAGS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0)  # samples
+_TIMES = (0.0, 1.0, 1.7, 3.0, 5.0, 9.0, 15.0, 26.0, 45.0, 80.0, 140.0)  # samples
+_PAST = 4  # samples that follow each other, of what is known already
+_LATE = (6, 9, 14, 22, 34)  # earlier ones of the inputs
+_SAMPLES_PER_COLUMN = 4
+_COUNTED = 2  # a lag and a time constant
+_RANK = 1e-7  # of columns of length 1: less is rounding
+
+
+class _Response(NamedTuple):
+    """Columns (n, q) of a channel's response, and how it acts in words."""
+
+    columns: FloatArray
+    way: str
+    advice: str
+
+
+def propose(context: ResidualContext) -> Iterator[Candidate]:
+    """Propose that a recorded channel acts beside the inputs."""
+    if is_difference(context.problem.model) or context.problem.prediction != "simulation":
+        return  # predictions know the noise of their samples
+    names = dict.fromkeys(one.name for record in context.problem.records for one in record.others)
+    if not names:
+        return
+    known = _list_known(context)
+    for name in names:
+        signal = _read(context, name)
+        if not np.ptp(signal) > 0 or _follows_output(context, signal):
+            continue
+        for response in _list_responses(context, name):
+            for number in context.choose_columns(response.columns):
+                column = response.columns[:, number]
+                if _tells_more(context, known, column):
+                    yield Candidate(
+                        "another input",
+                        "input",
+                        context.weigh(column),
+                        f"{name} acts as another input",
+                        f"the recorded channel {name} acts on the output {response.way}, and the "
+                        "model does not have it",
+                        response.advice,
+                        counted=_COUNTED,
+                    )
+
+
+def _list_responses(context: ResidualContext, name: str) -> Iterator[_Response]:
+    lagged = np.column_stack([_read(context, name, lag) for lag in _LAGS])
+    filtered = [_filter(context, lagged, samples) for samples in _TIMES]
+    outputs = " and ".join(output.name for output in context.problem.model.outputs)
+    yield _Response(
+        np.hstack(filtered),
+        "beside the plant",
+        f"Add {name} to the inputs of the model's document, to its states one with a first-order "
+        f"part driven by {name}, and that state to the output {outputs}.",
+    )
+    for channel in context.moving_inputs:
+        plant = _simulate_at_input(context, name, channel.name)
+        if plant is not None:
+            yield _Response(
+                _delay(context, plant),
+                f"at the input of the plant, as {channel.name} does",
+                f"Add {name} to the inputs of the model's document, and a term c*{name} to "
+                f"{channel.name} in its equations, with c as a parameter.",
+            )
+
+
+def _read(context: ResidualContext, name: str, lag: float = 0.0) -> FloatArray:
+    """Read a channel at the times (n,) of the samples, `lag` periods before; 0 where there is none.
+
+    Its mean over each experiment is taken away. A held channel is read after its jump.
+    """
+    values = np.zeros(context.times.size)
+    for part in context.parts:
+        for channel in context.problem.records[part.experiment].others:
+            if channel.name == name:
+                found = read_channel(channel, part.times, lag)
+                values[part.rows] = found - np.mean(found)
+    return values
+
+
+def _simulate_at_input(context: ResidualContext, name: str, at: str) -> FloatArray | None:
+    """Simulate what a channel adds (n,) if it acts where an input does, without its time lag."""
+    reach = compute_reach(context.problem, context.analysis)
+    records = []
+    for record in context.problem.records:
+        others = [one for one in record.others if one.name == name]
+        inputs = list(record.inputs)
+        for number, channel in enumerate(inputs):
+            if channel.name == at and others:
+                added = interpolate_known(others[0], channel.times + reach)
+                span = float(np.ptp(added))
+                scale = float(np.ptp(channel.values)) / span if span > 0 else 0.0
+                inputs[number] = replace(
+                    channel,
+                    values=channel.values + scale * (added - added[0]),
+                    hold=channel.effective_hold,
+                )
+        records.append(replace(record, inputs=tuple(inputs)))
+    try:
+        moved = context.simulate(records) - context.simulation
+    except SysidError:
+        return None
+    return moved if np.all(np.isfinite(moved)) and moved.any() else None
+
+
+def _delay(context: ResidualContext, values: FloatArray) -> FloatArray:
+    """Delay values (n,) by each of the lags, as columns (n, q)."""
+    columns = np.zeros((values.size, len(_LAGS)))
+    for part in context.parts:
+        own = values[part.rows]
+        at = np.arange(own.size)
+        for number, lag in enumerate(_LAGS):
+            columns[part.rows, number] = np.interp(at - lag, at, own)
+    return columns
+
+
+def _filter(context: ResidualContext, columns: FloatArray, samples: float) -> FloatArray:
+    """Filter columns (n, q) by a time constant of some samples; each rests at its first value."""
+    if not samples:
+        return columns
+    filtered = np.zeros(columns.shape)
+    for part in context.parts:
+        values = columns[part.rows]
+        n = values.shape[0]
+        length = 1 << (2 * n - 1).bit_length()
+        decay = np.exp(-np.arange(n) / samples) * -np.expm1(-1.0 / samples)
+        moved = rfft(values - values[0], length, axis=0) * rfft(decay, length)[:, None]
+        filtered[part.rows] = irfft(moved, length, axis=0)[:n] + values[0]
+    return filtered
+
+
+def _follows_output(context: ResidualContext, signal: FloatArray) -> bool:
+    """Whether the output and its past tell of a signal (n,) what its own past does not."""
+    own = [_shift(context, signal, lag) for lag in range(1, _PAST + 1)]
+    output = [
+        _shift(context, values, lag)
+        for values in (context.simulation, context.measurement)
+        for lag in range(_PAST)
+    ]
+    return _compute_gain(context, signal, [*_list_trend(context), *own], output) > STRONG_ODDS
+
+
+def _tells_more(context: ResidualContext, known: Sequence[FloatArray], column: FloatArray) -> bool:
+    """Whether the past of a column (n,) tells of the residuals what is not known of them."""
+    residuals = context.measurement - context.simulation
+    past = [_shift(context, column, 1)]
+    return _compute_gain(context, residuals, known, past, _COUNTED) > DEFECT_GAIN
+
+
+def _list_known(context: ResidualContext) -> list[FloatArray]:
+    """List what tells of the residuals: their past, the parameters, the inputs, the output."""
+    residuals = context.measurement - context.simulation
+    lags = range(1, _PAST + 1)
+    known = [*_list_trend(context), *(context.residual_model.columns / context.weight[:, None]).T]
+    known += [_shift(context, residuals, lag) for lag in lags]
+    known += [_shift(context, context.simulation, lag) for lag in (0, *lags)]
+    for channel in context.moving_inputs:
+        values = context.read_input(channel.name)
+        known += [_shift(context, values, lag) for lag in (0, *lags, *_LATE)]
+    return known
+
+
+def _list_trend(context: ResidualContext) -> list[FloatArray]:
+    """List a constant and a straight line (n,) for each series."""
+    columns = []
+    for part in context.parts:
+        constant, line = np.zeros(context.times.size), np.zeros(context.times.size)
+        constant[part.rows] = 1.0
+        line[part.rows] = np.linspace(-1.0, 1.0, part.times.size)
+        columns += [constant, line]
+    return columns
+
+
+def _shift(context: ResidualContext, values: FloatArray, lag: int) -> FloatArray:
+    """Shift values (n,) by some samples within each series."""
+    shifted = np.zeros(values.size)
+    for part in context.parts:
+        own = values[part.rows]
+        shifted[part.rows] = own[np.maximum(np.arange(own.size) - lag, 0)]
+    return shifted
+
+
+def _compute_gain(
+    context: ResidualContext,
+    values: FloatArray,
+    known: Sequence[FloatArray],
+    more: Sequence[FloatArray],
+    counted: int = 0,
+) -> float:
+    """Compute how much better values (n,) are explained with more columns (Schwarz's criterion)."""
+    is_later = np.concatenate([np.arange(part.times.size) >= _PAST for part in context.parts])
+    both = np.column_stack([*known, *more, values])[is_later]
+    n, columns = both.shape
+    if n < _SAMPLES_PER_COLUMN * columns:
+        return 0.0
+    length = np.linalg.norm(both, axis=0)
+    both = both / np.where(length > 0, length, 1.0)
+    shares = []
+    for count in (len(known), len(known) + len(more)):
+        left, singular, _ = np.linalg.svd(both[:, :count], full_matrices=False)
+        basis = left[:, singular > _RANK * singular[0]]
+        rest = both[:, -1] - basis @ (basis.T @ both[:, -1])
+        shares.append(max(float(rest @ rest), _RANK**2))
+    ratio = n * np.log(shares[0] / shares[1])
+    return float(ratio - (len(more) + counted) * np.log(n))
