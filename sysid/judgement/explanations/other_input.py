@@ -170,24 +170,25 @@ def _follows_output(context: ResidualContext, signal: FloatArray) -> bool:
     return _compute_gain(context, signal, [*_list_trend(context), *own], output) > STRONG_ODDS
 
 
-def _tells_more(context: ResidualContext, known: Sequence[FloatArray], column: FloatArray) -> bool:
-    """Whether the past of a column (n,) tells of the residuals what is not known of them."""
-    residuals = context.measurement - context.simulation
-    past = [_shift(context, column, 1)]
-    return _compute_gain(context, residuals, known, past, _COUNTED) > DEFECT_GAIN
+def _tells_more(context: ResidualContext, known: FloatArray, column: FloatArray) -> bool:
+    """Whether the past of a column (n,) tells of the residuals what is not known of them.
+
+    Their own past is the noise model's part.
+    """
+    past = context.weigh(_shift(context, column, 1))
+    model = context.residual_model
+    more = model.fit(np.hstack([known, past]), _COUNTED)
+    return model.fit(known).criterion - more.criterion > DEFECT_GAIN
 
 
-def _list_known(context: ResidualContext) -> list[FloatArray]:
-    """List what tells of the residuals: their past, the parameters, the inputs, the output."""
-    residuals = context.measurement - context.simulation
-    lags = range(1, _PAST + 1)
-    known = [*_list_trend(context), *(context.residual_model.columns / context.weight[:, None]).T]
-    known += [_shift(context, residuals, lag) for lag in lags]
-    known += [_shift(context, context.simulation, lag) for lag in (0, *lags)]
+def _list_known(context: ResidualContext) -> FloatArray:
+    """List columns (n, q) that tell of the residuals: the past of inputs and simulated output."""
+    lags = range(_PAST + 1)
+    known = [*_list_trend(context), *(_shift(context, context.simulation, lag) for lag in lags)]
     for channel in context.moving_inputs:
         values = context.read_input(channel.name)
-        known += [_shift(context, values, lag) for lag in (0, *lags, *_LATE)]
-    return known
+        known += [_shift(context, values, lag) for lag in (*lags, *_LATE)]
+    return context.weigh(np.column_stack(known))
 
 
 def _list_trend(context: ResidualContext) -> list[FloatArray]:
@@ -215,7 +216,6 @@ def _compute_gain(
     values: FloatArray,
     known: Sequence[FloatArray],
     more: Sequence[FloatArray],
-    counted: int = 0,
 ) -> float:
     """Compute how much better values (n,) are explained with more columns (Schwarz's criterion)."""
     is_later = np.concatenate([np.arange(part.times.size) >= _PAST for part in context.parts])
@@ -232,4 +232,4 @@ def _compute_gain(
         rest = both[:, -1] - basis @ (basis.T @ both[:, -1])
         shares.append(max(float(rest @ rest), _RANK**2))
     ratio = n * np.log(shares[0] / shares[1])
-    return float(ratio - (len(more) + counted) * np.log(n))
+    return float(ratio - len(more) * np.log(n))
