@@ -156,10 +156,10 @@ def find_signal_faults(body: JobBody, model: Model) -> Iterator[FieldError]:
             yield FieldError(
                 f"/channels/{name}", f"model {model.name!r} has no signal {name!r}{hint}"
             )
-    for name in body["hold"]:
-        if name not in inputs:
-            hint = suggest_name(name, inputs)
-            yield FieldError(f"/hold/{name}", f"model {model.name!r} has no input {name!r}{hint}")
+    for name, hold in body["hold"].items():
+        faults: list[FieldError] = []
+        collect_faults(check_holds, faults, model, {name: hold})
+        yield from faults
     for name, weight in (body["weights"] or {}).items():
         numbers = weight if isinstance(weight, list) else [weight]
         if name not in outputs:

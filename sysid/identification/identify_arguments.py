@@ -16,7 +16,7 @@ from sysid.data.foreign_tables import (
     is_labelled,
     read_columns,
 )
-from sysid.data.holds import HOLDS, HoldSetting
+from sysid.data.holds import HOLDS, OUTPUT_HOLDS, HoldSetting
 from sysid.data.records import Channel, Record, Recording, to_channel
 from sysid.data.value_checks import find_infinite_value
 from sysid.models.channel_assignment import (
@@ -49,7 +49,7 @@ def read_records(
     channels: Mapping[str, str] | None,
     hold: Mapping[str, HoldSetting] | None = None,
 ) -> ReadRecords:
-    """Read recordings as records of a model, with the given holds of its inputs.
+    """Read recordings as records of a model, with the given holds of its signals.
 
     A recording of several segments gives one record for each.
 
@@ -58,31 +58,53 @@ def read_records(
     InvalidRecord
         If an object is no recording, or a signal has no channel.
     InvalidSettings
-        If `channels` names a signal or channel that does not exist, or `hold` an input or a hold.
+        If `channels` names a signal or channel that does not exist, or `hold` a signal or a hold.
+        If values at irregular times are to be means.
     """
     holds = dict(hold or {})
-    _check_holds(model, holds)
+    check_holds(model, holds)
     each = data if isinstance(data, list | tuple) else [data]
     parts = [part for one in each for part in _read_one(model, one, channels)]
     records = tuple(record.replace_holds(holds) for record, _ in parts)
     for record in records:
         if fault := find_infinite_value((*record.inputs, *record.outputs)):
             raise InvalidRecord(fault)
+        _check_means(record, holds)
     assignments = {assigned.note: assigned for _, assigned in parts if assigned.note}
     notes = tuple(describe_assignment(one, records) for one in assignments.values())
     by_signal = parts[0][1].by_signal if parts else {}
     return ReadRecords(records, notes, by_signal)
 
 
-def _check_holds(model: Model, holds: Mapping[str, object]) -> None:
+def check_holds(model: Model, holds: Mapping[str, object]) -> None:
+    """Check the holds of signals.
+
+    Raises
+    ------
+    InvalidSettings
+        If there is no such signal, or no such hold of an input or an output.
+    """
     inputs = [signal.name for signal in model.inputs]
+    outputs = [signal.name for signal in model.outputs]
     for name, hold in holds.items():
         pointer = join_pointer("hold", str(name))
-        if name not in inputs:
-            hint = suggest_name(str(name), inputs)
-            raise InvalidSettings(pointer, f"model {model.name!r} has no input {name!r}{hint}")
-        if not isinstance(hold, str) or hold not in HOLDS:
-            raise InvalidSettings(pointer, f"found {hold!r}; need one of {', '.join(HOLDS)}")
+        if name not in (*inputs, *outputs):
+            hint = suggest_name(str(name), (*inputs, *outputs))
+            detail = f"model {model.name!r} has no input or output {name!r}{hint}"
+            raise InvalidSettings(pointer, detail)
+        side, known = ("input", HOLDS) if name in inputs else ("output", OUTPUT_HOLDS)
+        if not isinstance(hold, str) or hold not in known:
+            detail = f"found {hold!r}; an {side} needs one of {', '.join(known)}"
+            raise InvalidSettings(pointer, detail)
+
+
+def _check_means(record: Record, holds: Mapping[str, HoldSetting]) -> None:
+    for channel in (*record.inputs, *record.outputs):
+        if "mean" in holds.get(channel.name, ""):
+            try:
+                channel.read_period()
+            except InvalidRecord as error:
+                raise InvalidSettings(join_pointer("hold", channel.name), str(error)) from None
 
 
 def write_setting(field: str, entries: Mapping[str, str]) -> str:

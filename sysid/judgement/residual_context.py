@@ -600,6 +600,7 @@ def read_channel(channel: Channel, times: FloatArray, lag: float = 0.0) -> Float
 
     A held one is read after its jump.
     """
+    channel = channel.acting
     period = float(np.ptp(times)) / max(times.size - 1, 1)
     after = _AFTER if channel.effective_hold == "zero" else 0.0
     return interpolate_known(channel, times + (after - lag) * period)

@@ -6,10 +6,10 @@ input and through the plant. Each lag and time constant is a column, of which th
 A channel is an input only if its past tells of the residuals what their own past, the inputs and
 the simulated output do not (causality: Granger, Econometrica 37 (1969) 424). So the output in
 another unit, a clock, or the set point of a loop is none. A second sensor has noise of its own, and
-may tell more. But it follows the output, and what the output drives is no input.
+may tell more. But it follows the output, and what the output or an input drives is no input.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -35,6 +35,7 @@ _LATE = (6, 9, 14, 22, 34)  # earlier ones of the inputs
 _SAMPLES_PER_COLUMN = 4
 _COUNTED = 2  # a lag and a time constant
 _RANK = 1e-7  # of columns of length 1: less is rounding
+_REACH = 64  # samples, in which an input drives a channel
 
 
 class _Response(NamedTuple):
@@ -55,7 +56,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
     known = _list_known(context)
     for name in names:
         signal = _read(context, name)
-        if not np.ptp(signal) > 0 or _follows_output(context, signal):
+        if not np.ptp(signal) > 0 or _is_driven(context, signal):
             continue
         for response in _list_responses(context, name):
             for number in context.choose_columns(response.columns):
@@ -159,15 +160,23 @@ def _filter(context: ResidualContext, columns: FloatArray, samples: float) -> Fl
     return filtered
 
 
-def _follows_output(context: ResidualContext, signal: FloatArray) -> bool:
-    """Whether the output and its past tell of a signal (n,) what its own past does not."""
+def _is_driven(context: ResidualContext, signal: FloatArray) -> bool:
+    """Whether an input or the output tells of a signal (n,) what its own past does not."""
     own = [_shift(context, signal, lag) for lag in range(1, _PAST + 1)]
-    output = [
+    known = np.column_stack([*_list_trend(context), *own])
+    outputs = [
         _shift(context, values, lag)
         for values in (context.simulation, context.measurement)
         for lag in range(_PAST)
     ]
-    return _compute_gain(context, signal, [*_list_trend(context), *own], output) > STRONG_ODDS
+    if _compute_gain(context, signal, known, np.column_stack(outputs)) > STRONG_ODDS:
+        return True
+    for channel in context.moving_inputs:
+        values = context.read_input(channel.name)
+        past = np.column_stack([_shift(context, values, lag) for lag in range(_REACH)])
+        if _compute_gain(context, signal, known, past, is_one=True) > STRONG_ODDS:
+            return True
+    return False
 
 
 def _tells_more(context: ResidualContext, known: FloatArray, column: FloatArray) -> bool:
@@ -214,22 +223,38 @@ def _shift(context: ResidualContext, values: FloatArray, lag: int) -> FloatArray
 def _compute_gain(
     context: ResidualContext,
     values: FloatArray,
-    known: Sequence[FloatArray],
-    more: Sequence[FloatArray],
+    known: FloatArray,
+    more: FloatArray,
+    *,
+    is_one: bool = False,
 ) -> float:
-    """Compute how much better values (n,) are explained with more columns (Schwarz's criterion)."""
+    """Compute how much better values (n,) are explained with more columns (Schwarz's criterion).
+
+    With `is_one` the likeliest of them counts, and its choice counts as a parameter.
+    """
     is_later = np.concatenate([np.arange(part.times.size) >= _PAST for part in context.parts])
-    both = np.column_stack([*known, *more, values])[is_later]
-    n, columns = both.shape
-    if n < _SAMPLES_PER_COLUMN * columns:
+    n, used = int(np.count_nonzero(is_later)), 2 if is_one else more.shape[1]
+    if n < _SAMPLES_PER_COLUMN * (known.shape[1] + used):
         return 0.0
-    length = np.linalg.norm(both, axis=0)
-    both = both / np.where(length > 0, length, 1.0)
-    shares = []
-    for count in (len(known), len(known) + len(more)):
-        left, singular, _ = np.linalg.svd(both[:, :count], full_matrices=False)
-        basis = left[:, singular > _RANK * singular[0]]
-        rest = both[:, -1] - basis @ (basis.T @ both[:, -1])
-        shares.append(max(float(rest @ rest), _RANK**2))
-    ratio = n * np.log(shares[0] / shares[1])
-    return float(ratio - len(more) * np.log(n))
+    basis = _find_basis(known[is_later])
+    rest, added = (one - basis @ (basis.T @ one) for one in (values[is_later], more[is_later]))
+    before = float(rest @ rest)
+    if is_one:
+        lengths = np.linalg.norm(added, axis=0)
+        is_own = lengths > _RANK * np.linalg.norm(more[is_later], axis=0)
+        shares = np.where(is_own, (rest @ added) / np.where(is_own, lengths, 1.0), 0.0)
+        after = before - float(np.max(np.square(shares)))
+    else:
+        further = _find_basis(added, np.linalg.norm(more[is_later], axis=0))
+        after = before - float(np.sum(np.square(further.T @ rest)))
+    least = _RANK**2 * float(values[is_later] @ values[is_later])
+    return float(n * np.log(max(before, least) / max(after, least)) - used * np.log(n))
+
+
+def _find_basis(columns: FloatArray, lengths: FloatArray | None = None) -> FloatArray:
+    """Find an orthonormal basis of columns (n, q), by default each of length 1."""
+    length = np.linalg.norm(columns, axis=0) if lengths is None else lengths
+    left, singular, _ = np.linalg.svd(
+        columns / np.where(length > 0, length, 1.0), full_matrices=False
+    )
+    return np.asarray(left[:, singular > _RANK])
