@@ -13,6 +13,7 @@ from service.jobs.to_core import read_algorithm, read_fit
 from sysid.core.errors import RecordTooShort, SysidError, suggest_name
 from sysid.data.records import find_shared_channels
 from sysid.language.delays import has_varying_delay
+from sysid.models.channel_assignment import check_holds
 from sysid.models.model import Model
 from sysid.models.model_delays import check_record_length, compute_longest_delay, list_past_values
 from sysid.models.parameters import Parameter, override_parameters

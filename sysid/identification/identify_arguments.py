@@ -16,7 +16,7 @@ from sysid.data.foreign_tables import (
     is_labelled,
     read_columns,
 )
-from sysid.data.holds import HOLDS, OUTPUT_HOLDS, HoldSetting
+from sysid.data.holds import HoldSetting
 from sysid.data.records import Channel, Record, Recording, to_channel
 from sysid.data.value_checks import find_infinite_value
 from sysid.models.channel_assignment import (
@@ -24,6 +24,7 @@ from sysid.models.channel_assignment import (
     assign_channels,
     assign_record,
     assign_recording,
+    check_holds,
 )
 from sysid.models.model import Model
 from sysid.residuals.onset_delay import find_unprompted_output
@@ -74,28 +75,6 @@ def read_records(
     notes = tuple(describe_assignment(one, records) for one in assignments.values())
     by_signal = parts[0][1].by_signal if parts else {}
     return ReadRecords(records, notes, by_signal)
-
-
-def check_holds(model: Model, holds: Mapping[str, object]) -> None:
-    """Check the holds of signals.
-
-    Raises
-    ------
-    InvalidSettings
-        If there is no such signal, or no such hold of an input or an output.
-    """
-    inputs = [signal.name for signal in model.inputs]
-    outputs = [signal.name for signal in model.outputs]
-    for name, hold in holds.items():
-        pointer = join_pointer("hold", str(name))
-        if name not in (*inputs, *outputs):
-            hint = suggest_name(str(name), (*inputs, *outputs))
-            detail = f"model {model.name!r} has no input or output {name!r}{hint}"
-            raise InvalidSettings(pointer, detail)
-        side, known = ("input", HOLDS) if name in inputs else ("output", OUTPUT_HOLDS)
-        if not isinstance(hold, str) or hold not in known:
-            detail = f"found {hold!r}; an {side} needs one of {', '.join(known)}"
-            raise InvalidSettings(pointer, detail)
 
 
 def _check_means(record: Record, holds: Mapping[str, HoldSetting]) -> None:

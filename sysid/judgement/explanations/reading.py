@@ -29,8 +29,8 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             "held": ("zero", _keep, "is held between its samples"),
             "as straight lines": ("first", _keep, "runs in straight lines between its samples"),
             "as means that end at their stamps": (
-                "zero",
-                _shift_back,
+                "mean",
+                _keep,
                 "is the mean of the period that ends at its stamp",
             ),
             "as lines between its changes": (
@@ -40,7 +40,10 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             ),
         }
         for word, (hold, change, text) in others.items():
+            is_regular = channel.sampling.is_regular
             if change is _keep and hold == channel.effective_hold:
+                continue
+            if hold == "mean" and not is_regular:
                 continue
             records = context.replace_input(name, change, hold=hold)
             try:
@@ -49,7 +52,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 continue
             moved = other - context.simulation
             if np.all(np.isfinite(moved)) and moved.any():
-                is_sure = change is _keep and channel.sampling.is_regular
+                is_sure = change is _keep and is_regular
                 setting = f"Use hold: {{{name}: {hold}}}." if is_sure else ""
                 yield Candidate(
                     "reading of an input",
@@ -65,7 +68,12 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
 
 def _propose_means(context: ResidualContext) -> Iterator[Candidate]:
     """Propose that outputs are means of the period after or before their stamps."""
-    for side, word in ((1.0, "begins"), (-1.0, "ends")):
+    outputs = [channel for record in context.problem.records for channel in record.outputs]
+    if any(channel.hold in ("mean", "mean-after") for channel in outputs):
+        return
+    names = dict.fromkeys(channel.name for channel in outputs)
+    is_regular = all(channel.sampling.is_regular for channel in outputs)
+    for side, word, hold in ((1.0, "begins", "mean-after"), (-1.0, "ends", "mean")):
         try:
             mean = _simulate_means(context, side)
         except SysidError:
@@ -77,7 +85,9 @@ def _propose_means(context: ResidualContext) -> Iterator[Candidate]:
                 context.weigh(mean - context.simulation),
                 "the output is a mean",
                 f"the output is the mean of the period that {word} at its stamp",
-                "Move the stamps of the output to the middle of the period.",
+                f"Use hold: {{{', '.join(f'{name}: {hold}' for name in names)}}}."
+                if is_regular
+                else "Move the stamps of the output to the middle of the period.",
             )
 
 
@@ -122,11 +132,6 @@ def _list_fine_times(times: FloatArray, side: float) -> FloatArray:
 
 def _keep(values: FloatArray) -> FloatArray:
     return values
-
-
-def _shift_back(values: FloatArray) -> FloatArray:
-    """Let each value count from the sample before it on."""
-    return np.append(values[1:], values[-1])
 
 
 def _join_changes(values: FloatArray) -> FloatArray:
