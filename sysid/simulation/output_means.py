@@ -49,9 +49,7 @@ def average_outputs(
         states.append(ModelSignal(name))
         equations.append(output.expression)
         initial.append(FixedInitial(0.0))
-        rise = Binary(
-            "-", PastValue(name, "state"), PastValue(name, "state", delay=Number(period))
-        )
+        rise = Binary("-", PastValue(name, "state"), PastValue(name, "state", delay=Number(period)))
         outputs.append(replace(output, expression=Binary("/", rise, Number(period))))
     if len(states) == len(model.states):
         return model

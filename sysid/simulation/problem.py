@@ -280,9 +280,13 @@ class Problem:
             )
         )
         evaluator = (
-            _replace_measured(self.evaluator, self.averaged_model, experiments, self._has_grid_samples)
+            _replace_measured(
+                self.evaluator, self.averaged_model, experiments, self._has_grid_samples
+            )
             if are_alike
-            else _build_evaluator(self.averaged_model, experiments, self.all_parameters, self.settings)
+            else _build_evaluator(
+                self.averaged_model, experiments, self.all_parameters, self.settings
+            )
         )
         return replace(
             self,
