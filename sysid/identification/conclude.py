@@ -185,9 +185,18 @@ def _build_identification(
         run_residual_tests(problem, simulated, "estimation") if any(times.values()) else tests,
     )
     is_white = analysis.uncertainty is None or analysis.uncertainty.noise_colour == "white"
-    measures = compares_orders and not is_white  # beside white residuals nothing is better
+    # Beside white residuals nothing is better, and in a loop the controller's inverse is.
+    measures = compares_orders and not is_white and not feedback
     yardstick = fit_yardstick(problem, simulated) if measures else None
     is_of_the_solver = metrics.rms <= SOLVER_SHARE * problem.output_scale
+    explanations = select_explanations(
+        () if is_of_the_solver or feedback else explained.findings,
+        [
+            *find_other_orders(orders, problem.model.name, estimates),
+            *find_other_readings(problem, holds, doubts, estimates, rms),
+            *find_open_starts(best.starts, estimates),
+        ],
+    )
     findings = order_findings(
         [
             *find_disagreement(metrics, limit, are_residuals_noise=are_noise),
@@ -195,21 +204,14 @@ def _build_identification(
             *find_better_yardstick(
                 yardstick,
                 [one.name for one in estimates if one.is_free],
-                is_explained=any(one.gain for one in explained.findings),
+                explanations,
             ),
             *find_unsettled(
                 evidence, estimates, lambda: find_cause_in_bounds(problem, theta, analysis)
             ),
             *find_contradictions(problem, metrics, validated, estimates),
             *find_misled_run(estimates, ahead),
-            *select_explanations(
-                () if is_of_the_solver or feedback else explained.findings,
-                [
-                    *find_other_orders(orders, problem.model.name, estimates),
-                    *find_other_readings(problem, holds, doubts, estimates, rms),
-                    *find_open_starts(best.starts, estimates),
-                ],
-            ),
+            *explanations,
             *find_ambiguous(estimates),
             *find_open_terms(estimates, problem.model),
             *find_undetermined(problem, analysis, delays, are_residuals_noise=are_noise),
