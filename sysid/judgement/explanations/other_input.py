@@ -81,8 +81,8 @@ def _list_responses(context: ResidualContext, name: str) -> Iterator[_Response]:
     yield _Response(
         np.hstack(filtered),
         "beside the plant",
-        f"Add {name} to the inputs of the model's document, to its states one with a first-order "
-        f"part driven by {name}, and that state to the output {outputs}.",
+        f"Add {name} to the inputs of the model's document. Add a state that {name} drives by a "
+        f"first-order part, and add it to the output {outputs}.",
     )
     for channel in context.moving_inputs:
         plant = _simulate_at_input(context, name, channel.name)
