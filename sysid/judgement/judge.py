@@ -17,6 +17,7 @@ from sysid.judgement.explanations import (
     reading,
     sensor,
     structure,
+    switches,
 )
 from sysid.judgement.explanations.noise import (
     find_disagreement_of_frequencies,
@@ -43,7 +44,7 @@ _PROPOSERS = (
     reading.propose,
     other_input.propose,
 )
-_COSTLY_PROPOSERS = (actuator.propose, actuator.propose_loads)
+_COSTLY_PROPOSERS = (actuator.propose, actuator.propose_loads, switches.propose)
 """Each of their explanations takes a simulation: only if the residuals depend on anything."""
 _LIKELY = 0.01  # of the ratio of one candidate: then the costly ones are looked at as well
 _BY_ORDER = ("one more time constant", "filter of a sensor")  # another order is the full fit
