@@ -52,7 +52,7 @@ _MOST_SHARE = 0.5  # columns for a sample: with 0.8, noise gains 12 in one of 20
 _MOST_FINDINGS = 3  # that are found beside each other
 _MOST_TOLD = 3  # moves in a sentence
 _MOST_RIVALS = 2  # in a sentence
-_MOST_REFITTED = 3  # explanations that are fitted in full
+_MOST_REFITTED = 6  # explanations that are fitted in full
 
 
 class _Scored(NamedTuple):
@@ -195,11 +195,12 @@ def _refit_finalists(
 ) -> list[_Scored]:
     """Fit in full the likeliest explanations of which each is another record.
 
-    They may move the parameters by far more than a linear step.
+    They may move the parameters by far more than a linear step. Of a whole other record, the full
+    fit counts: a column may be scaled, and then says something else.
     """
     refitted, tried = list(scored), dict[str, int]()
     for position, one in enumerate(scored):
-        name = one.candidate.explanation
+        name = one.candidate.text if one.candidate.is_whole else one.candidate.explanation
         if len(tried) == _MOST_REFITTED or one.gain <= 0.0:
             break
         if one.candidate.records is None or name in tried:
@@ -210,7 +211,9 @@ def _refit_finalists(
             continue
         used = (1 + one.candidate.counted) * np.log(max(context.times.size, 2))
         gain = float(criterion - found.criterion - used)
-        if gain > one.gain - STRONG_ODDS:
+        if one.candidate.is_whole:
+            refitted[position] = one._replace(gain=gain, moves=found.moves)
+        elif gain > one.gain - STRONG_ODDS:
             refitted[position] = one._replace(gain=max(gain, one.gain), moves=found.moves)
     parted = _part_finalist(context, scored, criterion)
     return _order([*refitted, *parted])

@@ -63,6 +63,8 @@ class Candidate:
         Where something changes, s.
     records : sequence of Record, or None
         Records with which the model is fitted again, for moves that are not linear.
+    is_whole : bool
+        Whether these records are all that it says, as another reading is: not a share of them.
     doubtful : collection of str
         Parameters that take its place in the model, whatever the step to it: a time lag that of
         missing parts, and of clocks.
@@ -83,6 +85,7 @@ class Candidate:
     varies: tuple[int, float, float] | None = None
     moment: float | None = None
     records: Sequence[Record] | None = None
+    is_whole: bool = False
     doubtful: Collection[str] = ()
     is_vague: bool = False
     is_added: bool = False

@@ -6,7 +6,7 @@ reading) - ŷ.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from contextlib import suppress
 
 import numpy as np
 
@@ -15,8 +15,6 @@ from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 from sysid.judgement.residual_context import Candidate, ResidualContext
 from sysid.kernels.signals.past_reads import is_difference
-
-_FINE = 8  # values in a period of a mean
 
 
 def propose(context: ResidualContext) -> Iterator[Candidate]:
@@ -62,6 +60,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                     f"the data say that {name} {text}",
                     setting,
                     records=records,
+                    is_whole=True,
                 )
     yield from _propose_means(context)
 
@@ -71,63 +70,26 @@ def _propose_means(context: ResidualContext) -> Iterator[Candidate]:
     outputs = [channel for record in context.problem.records for channel in record.outputs]
     if any(channel.hold in ("mean", "mean-after") for channel in outputs):
         return
+    if not all(channel.sampling.is_regular for channel in outputs):
+        return
     names = dict.fromkeys(channel.name for channel in outputs)
-    is_regular = all(channel.sampling.is_regular for channel in outputs)
-    for side, word, hold in ((1.0, "begins", "mean-after"), (-1.0, "ends", "mean")):
-        try:
-            mean = _simulate_means(context, side)
-        except SysidError:
-            continue
-        if np.all(np.isfinite(mean)):
-            yield Candidate(
-                "mean of a period",
-                "reading",
-                context.weigh(mean - context.simulation),
-                "the output is a mean",
-                f"the output is the mean of the period that {word} at its stamp",
-                f"Use hold: {{{', '.join(f'{name}: {hold}' for name in names)}}}."
-                if is_regular
-                else "Move the stamps of the output to the middle of the period.",
-            )
-
-
-def _simulate_means(context: ResidualContext, side: float) -> FloatArray:
-    """Simulate the means (n,) of the periods to one side of each scored sample.
-
-    They are ``nan`` if no more simulations are allowed.
-    """
-    if not context.simulations.allow(1):
-        return np.full(context.times.size, np.nan)
-    context.simulations.spent += 1
-    problem, records = context.problem, []
-    for record in problem.records:
-        outputs = []
-        for channel in record.outputs:
-            times = _list_fine_times(channel.times, side)
-            inside = (times >= record.start) & (times <= record.stop)
-            distinct = np.unique(times[inside])
-            outputs.append(replace(channel, times=distinct, values=np.zeros(distinct.size)))
-        records.append(replace(record, outputs=tuple(outputs)))
-    fine = problem.rebuild(
-        records=records, weights=problem.output_weights, scored_from=None, skip=0
-    )
-    predicted = fine.split_by_output(fine.predict(context.theta[None])[0])
-    means = np.zeros(context.times.size)
-    for part in context.parts:
-        [channel] = [
-            one for one in fine.records[part.experiment].outputs if one.name == part.output
-        ]
-        values = predicted[part.experiment][part.output]
-        period = float(np.median(np.diff(part.times)))
-        offsets = side * period * (np.arange(_FINE) + 0.5) / _FINE
-        wanted = part.times[:, None] + offsets
-        means[part.rows] = np.mean(np.interp(wanted, channel.times, values), axis=1)
-    return means
-
-
-def _list_fine_times(times: FloatArray, side: float) -> FloatArray:
-    period = float(np.median(np.diff(times)))
-    return np.asarray((times[:, None] + side * period * np.arange(_FINE + 1) / _FINE).ravel())
+    words: tuple[tuple[Hold, str], ...] = (("mean-after", "begins"), ("mean", "ends"))
+    for hold, word in words:
+        holds = dict.fromkeys(names, hold)
+        records = [record.replace_holds(holds) for record in context.problem.records]
+        with suppress(SysidError):
+            moved = context.simulate(records) - context.simulation
+            if np.all(np.isfinite(moved)):
+                yield Candidate(
+                    "mean of a period",
+                    "reading",
+                    context.weigh(moved),
+                    "the output is a mean",
+                    f"the output is the mean of the period that {word} at its stamp",
+                    f"Use hold: {{{', '.join(f'{name}: {hold}' for name in names)}}}.",
+                    records=records,
+                    is_whole=True,
+                )
 
 
 def _keep(values: FloatArray) -> FloatArray:

@@ -55,6 +55,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                     f"Record {channel.name} at the moments at which it changes.",
                     counted=used,
                     records=records,
+                    is_whole=True,
                 )
 
 
