@@ -19,6 +19,7 @@ from sysid.models.model_delays import check_record_length, compute_longest_delay
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.sections import get_interval
 from sysid.models.unit_checks import SignalUnits
+from sysid.simulation.output_means import MEANS, check_mean_output
 
 if TYPE_CHECKING:
     from service.storage.tables import Dataset
@@ -160,6 +161,8 @@ def find_signal_faults(body: JobBody, model: Model) -> Iterator[FieldError]:
     for name, hold in body["hold"].items():
         faults: list[FieldError] = []
         collect_faults(check_holds, faults, model, {name: hold})
+        if name in outputs and hold in MEANS:
+            collect_faults(check_mean_output, faults, model, name, body["prediction"])
         yield from faults
     for name, weight in (body["weights"] or {}).items():
         numbers = weight if isinstance(weight, list) else [weight]

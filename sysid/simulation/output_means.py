@@ -14,7 +14,8 @@ from sysid.kernels.signals.past_reads import is_difference
 from sysid.language.tree import Binary, Number, PastValue
 from sysid.models.model import FixedInitial, Model, ModelSignal
 
-_MEANS = ("mean", "mean-after")
+MEANS = ("mean", "mean-after")
+"""Holds of an output that is a mean."""
 _PERIOD_TOLERANCE = 1e-3  # relative difference of the periods of two records
 
 
@@ -38,13 +39,7 @@ def average_outputs(
         if period is None:
             outputs.append(output)
             continue
-        if is_difference(model) or prediction != "simulation":
-            what = "a recursion" if is_difference(model) else "a prediction one step ahead"
-            raise InvalidSettings(
-                join_pointer("hold", output.name),
-                f"output {output.name!r} is a mean of a period, but {what} needs values at the "
-                "times of the samples. Use a differential model and a free run, or hold auto",
-            )
+        check_mean_output(model, output.name, prediction)
         name = f"∫{output.name}"
         states.append(ModelSignal(name))
         equations.append(output.expression)
@@ -63,12 +58,29 @@ def average_outputs(
     )
 
 
+def check_mean_output(model: Model, name: str, prediction: PredictionKind) -> None:
+    """Check that an output of a model may be a mean.
+
+    Raises
+    ------
+    InvalidSettings
+        If the model is a recursion, or is to predict one step ahead.
+    """
+    if is_difference(model) or prediction != "simulation":
+        what = "a recursion" if is_difference(model) else "a prediction one step ahead"
+        raise InvalidSettings(
+            join_pointer("hold", name),
+            f"output {name!r} is a mean of a period, but {what} needs values at the times of the "
+            "samples. Use a differential model and a free run, or hold auto",
+        )
+
+
 def locate_mean(channel: Channel) -> tuple[Channel, float]:
     """Put each mean at the end of its period; return when (s) the first one begins.
 
     A channel without means begins at its first sample.
     """
-    if channel.hold not in _MEANS:
+    if channel.hold not in MEANS:
         return channel, float(channel.times[0])
     period = channel.read_period()
     if channel.hold == "mean-after":
@@ -79,7 +91,7 @@ def locate_mean(channel: Channel) -> tuple[Channel, float]:
 def _find_period(name: str, records: Sequence[Record]) -> float | None:
     """Find the period (s) of which an output has means; None if it has none."""
     channels = [one for record in records for one in record.outputs if one.name == name]
-    means = [one for one in channels if one.hold in _MEANS]
+    means = [one for one in channels if one.hold in MEANS]
     if not means:
         return None
     try:
