@@ -56,6 +56,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                     counted=used,
                     records=records,
                     is_whole=True,
+                    doubtful=context.delays,
                 )
 
 
