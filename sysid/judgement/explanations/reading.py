@@ -76,6 +76,8 @@ def _propose_means(context: ResidualContext) -> Iterator[Candidate]:
     words: tuple[tuple[Hold, str], ...] = (("mean-after", "begins"), ("mean", "ends"))
     for hold, word in words:
         holds = dict.fromkeys(names, hold)
+        first, *others = names
+        more = "".join(f", {name}: {hold}" for name in others)
         records = [record.replace_holds(holds) for record in context.problem.records]
         with suppress(SysidError):
             moved = context.simulate(records) - context.simulation
@@ -86,7 +88,7 @@ def _propose_means(context: ResidualContext) -> Iterator[Candidate]:
                     context.weigh(moved),
                     "the output is a mean",
                     f"the output is the mean of the period that {word} at its stamp",
-                    f"Use hold: {{{', '.join(f'{name}: {hold}' for name in names)}}}.",
+                    f"Use hold: {{{first}: {hold}{more}}}.",
                     records=records,
                     is_whole=True,
                 )

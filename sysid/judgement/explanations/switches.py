@@ -102,7 +102,8 @@ def _estimate_early(
     many parameters of Schwarz's criterion take as much as the marginal likelihood does.
     """
     model, z = context.residual_model, context.weigh(columns)
-    basis, _ = np.linalg.qr(model.columns / np.linalg.norm(model.columns, axis=0))
+    lengths = np.linalg.norm(model.columns, axis=0)
+    basis, _ = np.linalg.qr(model.columns / np.where(lengths > 0, lengths, 1.0))
     rest = model.residuals - context.weigh(moved)[:, 0] + z @ early
     rest = rest - basis @ (basis.T @ rest)
     z = z - basis @ (basis.T @ z)
