@@ -6,17 +6,19 @@ with all blocks, and the best of many choices fits even noise. So the logarithm 
 subtracted from the gain (Bonferroni).
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from math import ceil, log
 
 import numpy as np
 from numpy.fft import rfft
 
 from sysid.core.types import FloatArray, IntArray
-from sysid.judgement.black_box import LeftOut, Samples, simulate_left_out
+from sysid.data.interpolation import interpolate_channel
+from sysid.data.records import Channel
+from sysid.judgement.black_box import Samples, simulate_left_out
 from sysid.residuals.autocorrelation import ROUNDING_SHARE, space_residuals
-from sysid.residuals.series import ResidualPart, iterate_parts
+from sysid.residuals.series import iterate_parts
 from sysid.simulation.fit_metrics import EXPLAINED_PERCENT, rms
 from sysid.simulation.problem import Problem
 
@@ -96,33 +98,65 @@ def fit_yardstick(problem: Problem, simulated: FloatArray) -> Yardstick | None:
         errors of the solver only.
     """
     inputs = [[record[one.name] for record in problem.records] for one in problem.model.inputs]
-    if not inputs:
-        return None
-    parts, rows = list(iterate_parts(problem)), problem.scored_rows
-    known = list[Yardstick]()
-    for output in dict.fromkeys(part.output for part in parts):
-        own = [part for part in parts if part.output == output]
-        samples = _read_samples(own, problem.evaluator.measured[rows], len(problem.records))
-        model = np.concatenate([simulated[rows][part.rows] for part in own])
-        left_out = simulate_left_out(inputs, samples) if _tells(samples, model) else None
-        if left_out is not None:
-            known += _compare(output, samples, model, left_out)
+    compared = [
+        _compare(output, inputs, *_read_samples(problem, simulated, output))
+        for output in dict.fromkeys(part.output for part in iterate_parts(problem))
+    ]
+    known = [yardstick for yardstick in compared if yardstick is not None]
     return max(known, key=lambda one: (one.is_clearly_better, one.gain), default=None)
 
 
-def _read_samples(parts: Sequence[ResidualPart], measured: FloatArray, experiments: int) -> Samples:
-    """Read the scored samples of an output, and divide those of each experiment into blocks."""
+def fit_reverse(
+    problem: Problem, simulated: FloatArray, cause: str, effect: str
+) -> Yardstick | None:
+    """Fit linear models to an input with an output as their input, and compare as fits in %.
+
+    The user's model counts as if it left the same share of the input as it leaves of the output.
+
+    Parameters
+    ----------
+    simulated : FloatArray, shape (M,)
+        Values that the user's model simulates at the measured times.
+    cause, effect : str
+        Input and output of the model.
+    """
+    samples, model = _read_samples(problem, simulated, effect)
+    if not _tells(samples, model):
+        return None
+    values, drivers = np.zeros(samples.times.size), list[Channel]()
+    for number, record in enumerate(problem.records):
+        [given] = [one for one in record.inputs if one.name == cause]
+        [answer] = [one for one in record.outputs if one.name == effect]
+        own = samples.experiment == number
+        values[own] = interpolate_channel(replace(given, hold="first"), samples.times[own])
+        drivers.append(replace(answer, hold="first"))
+    left = (samples.values - model) * float(np.std(values) / np.std(samples.values))
+    return _compare(cause, [drivers], samples._replace(values=values), values - left)
+
+
+def _read_samples(
+    problem: Problem, simulated: FloatArray, output: str
+) -> tuple[Samples, FloatArray]:
+    """Read the scored samples of an output, in blocks, and the simulated values (N,)."""
+    measured, model = (
+        problem.evaluator.measured[problem.scored_rows],
+        simulated[problem.scored_rows],
+    )
     columns = list[tuple[FloatArray, ...]]()
-    halves = 2 * max(round(_BLOCKS / experiments), 1)
-    for count, part in enumerate(parts):
+    halves = 2 * max(round(_BLOCKS / len(problem.records)), 1)
+    for part in iterate_parts(problem):
+        if part.output != output:
+            continue
         size = part.times.size
         block = np.full(size, -1)
         for number, own in enumerate(
             np.array_split(np.arange(ceil(_WARM_UP * size), size), halves)
         ):
-            block[own] = halves * count + number
-        columns.append((np.full(size, part.experiment), part.times, measured[part.rows], block))
-    return Samples(*map(np.concatenate, zip(*columns, strict=True)))
+            block[own] = halves * len(columns) + number
+        experiment = np.full(size, part.experiment)
+        columns.append((experiment, part.times, measured[part.rows], block, model[part.rows]))
+    *joined, own_model = map(np.concatenate, zip(*columns, strict=True))
+    return Samples(*joined), own_model
 
 
 def _tells(samples: Samples, model: FloatArray) -> bool:
@@ -138,27 +172,31 @@ def _tells(samples: Samples, model: FloatArray) -> bool:
 
 
 def _compare(
-    output: str, samples: Samples, model: FloatArray, left_out: LeftOut
-) -> Iterator[Yardstick]:
-    """Compare both models on left-out samples, if these move."""
+    output: str, inputs: Sequence[Sequence[Channel]], samples: Samples, model: FloatArray
+) -> Yardstick | None:
+    """Fit linear models of inputs (U, E) and compare them; None if too little can be compared."""
+    left_out = simulate_left_out(inputs, samples) if _tells(samples, model) and inputs else None
+    if left_out is None:
+        return None
     told = np.isfinite(left_out.values)
     experiments, values = samples.experiment[told], samples.values[told]
     means = np.bincount(experiments, values) / np.maximum(np.bincount(experiments), 1)
     spread = rms(values - means[experiments])
     own_errors, errors = values - model[told], values - left_out.values[told]
     own, other = rms(own_errors), rms(errors)
-    if min(spread, own, other) > 0.0:
-        gain = _compute_gain(experiments, samples.times[told], own_errors, errors)
-        yield Yardstick(
-            output,
-            left_out.order,
-            values.size,
-            100.0 * (1.0 - other / spread),
-            100.0 * (1.0 - own / spread),
-            other,
-            own,
-            gain - left_out.choices,
-        )
+    if not min(spread, own, other) > 0.0:
+        return None
+    gain = _compute_gain(experiments, samples.times[told], own_errors, errors)
+    return Yardstick(
+        output,
+        left_out.order,
+        values.size,
+        100.0 * (1.0 - other / spread),
+        100.0 * (1.0 - own / spread),
+        other,
+        own,
+        gain - left_out.choices,
+    )
 
 
 def _compute_gain(
