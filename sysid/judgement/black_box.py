@@ -281,7 +281,7 @@ def _fit_linear(grid: _Grid, rows: _Rows, sections: list[_Section]) -> _FittedSe
 
 def _invert(gram: FloatArray) -> FloatArray:
     """Invert a matrix of products (P, P) of columns."""
-    size = np.sqrt(np.maximum(gram.diagonal(), 1e-300))
+    size = np.sqrt(np.maximum(gram.diagonal(), 1e-200))
     scaled = gram / np.outer(size, size) + _RIDGE * np.eye(size.size)
     return np.asarray(np.linalg.inv(scaled) / np.outer(size, size))
 
