@@ -90,7 +90,7 @@ def explain_residuals(context: ResidualContext) -> Explained:
         return Explained(is_doubtful=context.simulations.is_cut_short)
     base = context.residual_model.without
     before: ColumnFit | None = None
-    taken, counted = np.zeros((context.times.size, 0)), 0
+    taken, counted = list[FloatArray](), 0
     candidates = list(_list_candidates(context, _PROPOSERS))
     scored = _score(context, candidates, taken, counted, base.criterion)
     if base.is_coloured or any(_is_likely(one, context.times.size) for one in scored):
@@ -113,7 +113,7 @@ def explain_residuals(context: ResidualContext) -> Explained:
             findings.append(_describe(context, best, before, rivals))
         if best.moves is not None:
             break  # the estimate is another one then
-        taken = np.hstack([taken, best.candidate.columns])
+        taken.append(best.candidate.columns)
         counted += best.candidate.counted
         base = before = best.fit
         candidates = [one.candidate for one in scored if one.gain > DEFECT_GAIN][1:]
@@ -168,18 +168,16 @@ def _have_lengths(columns: FloatArray) -> bool:
 def _score(
     context: ResidualContext,
     candidates: Sequence[Candidate],
-    taken: FloatArray,
+    taken: Sequence[FloatArray],
     counted: int,
     criterion: float,
 ) -> list[_Scored]:
     """Score candidates beside the columns (n, t) that are taken, the largest gain first."""
-    scored = []
-    for candidate in candidates:
-        fit = context.residual_model.fit(
-            np.hstack([taken, candidate.columns]), counted + candidate.counted
-        )
-        scored.append(_Scored(candidate, fit, criterion - fit.criterion))
-    return _order(scored)
+    fits = context.residual_model.fit_each(
+        [one.columns for one in candidates], [counted + one.counted for one in candidates], taken
+    )
+    pairs = zip(candidates, fits, strict=True)
+    return _order([_Scored(one, fit, criterion - fit.criterion) for one, fit in pairs])
 
 
 def _order(scored: Sequence[_Scored]) -> list[_Scored]:

@@ -14,10 +14,11 @@ from sysid.core.units import format_unit
 from sysid.data.holds import Hold
 from sysid.data.interpolation import interpolate_channel
 from sysid.data.records import Channel, Record
-from sysid.judgement.residual_model import ColumnFit, OutputNoise, ResidualModel
+from sysid.judgement.lagged_products import OutputNoise
+from sysid.judgement.residual_model import ColumnFit, ResidualModel
 from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.kernels.signals.past_reads import is_difference, list_delayed_values
-from sysid.models.model import MAX_SUBSTEPS, Model, replace_substeps
+from sysid.models.model import MAX_SUBSTEPS, replace_substeps
 from sysid.models.ties import collect_parameter_names
 from sysid.residuals.series import ResidualPart, iterate_parts
 from sysid.results.findings import Family, Move
@@ -196,7 +197,10 @@ class ResidualContext:
         if is_difference(model) or steps > MAX_SUBSTEPS:
             return nothing
         try:
-            added = self.simulate(model=replace_substeps(model, steps)) - self.simulation
+            finer = self.problem.rebuild(
+                model=replace_substeps(model, steps), weights=self.problem.output_weights
+            )
+            added = self._predict(finer) - self.simulation
         except SysidError:
             return nothing
         return self.weight * added if np.all(np.isfinite(added)) else nothing
@@ -393,15 +397,12 @@ class ResidualContext:
                 shifted[part.rows.start + first : part.rows.stop] = slope[part.rows][:length]
         return shifted
 
-    def simulate(
-        self, records: Sequence[Record] | None = None, model: Model | None = None
-    ) -> FloatArray:
-        """Simulate the scored values (n,) with other inputs or another model.
+    def simulate(self, records: Sequence[Record]) -> FloatArray:
+        """Simulate the scored values (n,) with other inputs.
 
         They are ``nan`` if no more simulations are allowed.
         """
-        weights = self.problem.output_weights
-        return self._predict(self.problem.rebuild(records=records, model=model, weights=weights))
+        return self._predict(self.problem.replace_inputs(records))
 
     def replace_input(
         self, name: str, change: Callable[[FloatArray], FloatArray], hold: Hold | None = None
