@@ -86,13 +86,37 @@ def explain_residuals(context: ResidualContext) -> Explained:
     (stepwise by Schwarz's criterion). One that is taken twice, such as a limit at two levels, is
     told once. If no simulations are left for some explanations, it is not done.
     """
-    if not (_is_possible(context) and np.all(np.isfinite(context.simulation))):
+    if not _is_possible(context):
         return Explained(is_doubtful=context.simulations.is_cut_short)
+    return _explain(context, _score_at_once(context))
+
+
+def explain_if_noise(context: ResidualContext) -> Explained:
+    """Explain the residuals as far as it takes to tell whether nothing but noise is left.
+
+    If an explanation that takes no simulation has strong odds and moves an estimate, it is not
+    done: the others would have to explain more and move nothing.
+    """
+    if not _is_possible(context):
+        return Explained()
+    scored = _score_at_once(context)
+    is_likely = bool(scored) and scored[0].gain > STRONG_ODDS
+    if is_likely and _describe(context, scored[0], None, ()).parameters:
+        return Explained(is_doubtful=True)
+    return _explain(context, scored)
+
+
+def _score_at_once(context: ResidualContext) -> list[_Scored]:
+    """Score the explanations that take few simulations or none."""
+    criterion = context.residual_model.without.criterion
+    return _score(context, list(_list_candidates(context, _PROPOSERS)), [], 0, criterion)
+
+
+def _explain(context: ResidualContext, scored: list[_Scored]) -> Explained:
+    """Explain residuals, beginning with the explanations that are scored already."""
     base = context.residual_model.without
     before: ColumnFit | None = None
     taken, counted = list[FloatArray](), 0
-    candidates = list(_list_candidates(context, _PROPOSERS))
-    scored = _score(context, candidates, taken, counted, base.criterion)
     if base.is_coloured or any(_is_likely(one, context.times.size) for one in scored):
         costly = list(_list_candidates(context, _COSTLY_PROPOSERS))
         scored += _score(context, costly, taken, counted, base.criterion)
@@ -136,7 +160,9 @@ def _is_possible(context: ResidualContext) -> bool:
         return False  # its first samples are predicted from an assumed past, which looks like more
     if any(part.repeats is not None for part in context.parts):
         return False  # samples of a repeat share their noise, which is no series in time
-    return bool(np.any(error)) and error.size > 2 * columns.shape[1] + 10
+    if not (np.any(error) and error.size > 2 * columns.shape[1] + 10):
+        return False
+    return bool(np.all(np.isfinite(context.simulation)))
 
 
 def _is_likely(scored: _Scored, samples: int) -> bool:
