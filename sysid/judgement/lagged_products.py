@@ -127,7 +127,7 @@ class LaggedProducts:
         products = (pairs @ whole.reshape(b, lags * lags, k * k)).reshape(b, k, k)
         products /= power[:, None, None]
         if not self.most:
-            return products
+            return np.asarray(products)
         lag = np.arange(self.most)[:, None] - np.arange(self.most)
         filtered = np.where(lag >= 0, filters[:, np.maximum(lag, 0)], 0.0)
         is_first = np.arange(self.most) < orders[:, None]
