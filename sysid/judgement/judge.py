@@ -89,13 +89,37 @@ def explain_residuals(context: ResidualContext) -> Explained:
     (stepwise by Schwarz's criterion). One that is taken twice, such as a limit at two levels, is
     told once. If no simulations are left for some explanations, it is not done.
     """
-    if not (_is_possible(context) and np.all(np.isfinite(context.simulation))):
+    if not _is_possible(context):
         return Explained(is_doubtful=context.simulations.is_cut_short)
+    return _explain(context, _score_at_once(context))
+
+
+def explain_if_noise(context: ResidualContext) -> Explained:
+    """Explain the residuals as far as it takes to tell whether nothing but noise is left.
+
+    If an explanation that takes no simulation has strong odds and moves an estimate, it is not
+    done: the others would have to explain more and move nothing.
+    """
+    if not _is_possible(context):
+        return Explained()
+    scored = _score_at_once(context)
+    is_likely = bool(scored) and scored[0].gain > STRONG_ODDS
+    if is_likely and _describe(context, scored[0], None, ()).parameters:
+        return Explained(is_doubtful=True)
+    return _explain(context, scored)
+
+
+def _score_at_once(context: ResidualContext) -> list[_Scored]:
+    """Score the explanations that take few simulations or none."""
+    criterion = context.residual_model.without.criterion
+    return _score(context, list(_list_candidates(context, _PROPOSERS)), [], 0, criterion)
+
+
+def _explain(context: ResidualContext, scored: list[_Scored]) -> Explained:
+    """Explain residuals, beginning with the explanations that are scored already."""
     base = context.residual_model.without
     before: ColumnFit | None = None
-    taken, counted = np.zeros((context.times.size, 0)), 0
-    candidates = list(_list_candidates(context, _PROPOSERS))
-    scored = _score(context, candidates, taken, counted, base.criterion)
+    taken, counted = list[FloatArray](), 0
     if base.is_coloured or any(_is_likely(one, context.times.size) for one in scored):
         costly = list(_list_candidates(context, _COSTLY_PROPOSERS))
         scored += _score(context, costly, taken, counted, base.criterion)
@@ -116,7 +140,7 @@ def explain_residuals(context: ResidualContext) -> Explained:
             findings.append(_describe(context, best, before, rivals))
         if best.moves is not None:
             break  # the estimate is another one then
-        taken = np.hstack([taken, best.candidate.columns])
+        taken.append(best.candidate.columns)
         counted += best.candidate.counted
         base = before = best.fit
         candidates = [one.candidate for one in scored if one.gain > DEFECT_GAIN][1:]
@@ -139,7 +163,9 @@ def _is_possible(context: ResidualContext) -> bool:
         return False  # its first samples are predicted from an assumed past, which looks like more
     if any(part.repeats is not None for part in context.parts):
         return False  # samples of a repeat share their noise, which is no series in time
-    return bool(np.any(error)) and error.size > 2 * columns.shape[1] + 10
+    if not (np.any(error) and error.size > 2 * columns.shape[1] + 10):
+        return False
+    return bool(np.all(np.isfinite(context.simulation)))
 
 
 def _is_likely(scored: _Scored, samples: int) -> bool:
@@ -171,18 +197,16 @@ def _have_lengths(columns: FloatArray) -> bool:
 def _score(
     context: ResidualContext,
     candidates: Sequence[Candidate],
-    taken: FloatArray,
+    taken: Sequence[FloatArray],
     counted: int,
     criterion: float,
 ) -> list[_Scored]:
     """Score candidates beside the columns (n, t) that are taken, the largest gain first."""
-    scored = []
-    for candidate in candidates:
-        fit = context.residual_model.fit(
-            np.hstack([taken, candidate.columns]), counted + candidate.counted
-        )
-        scored.append(_Scored(candidate, fit, criterion - fit.criterion))
-    return _order(scored)
+    fits = context.residual_model.fit_each(
+        [one.columns for one in candidates], [counted + one.counted for one in candidates], taken
+    )
+    pairs = zip(candidates, fits, strict=True)
+    return _order([_Scored(one, fit, criterion - fit.criterion) for one, fit in pairs])
 
 
 def _order(scored: Sequence[_Scored]) -> list[_Scored]:

@@ -29,7 +29,7 @@ from sysid.core.settings import FitSettings, Loss, StartKind
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
-from sysid.judgement.judge import explain_residuals
+from sysid.judgement.judge import explain_if_noise
 from sysid.judgement.levels import SEPARABLE, UNLIKELY_MOVE
 from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
 from sysid.models.catalogue.load import load_model
@@ -149,7 +149,7 @@ def _judge_fit(
     comparison: OrderComparison, model: str, context: ResidualContext
 ) -> OrderComparison:
     """Judge whether nothing but noise is left by the fit of a model."""
-    leaves_noise = explain_residuals(context).is_noise
+    leaves_noise = explain_if_noise(context).is_noise
     fits = tuple(
         replace(fit, leaves_noise=leaves_noise) if fit.model == model else fit
         for fit in comparison.fits

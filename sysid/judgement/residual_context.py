@@ -14,10 +14,11 @@ from sysid.core.units import format_unit
 from sysid.data.holds import Hold
 from sysid.data.interpolation import interpolate_channel
 from sysid.data.records import Channel, Record, keep_outputs
-from sysid.judgement.residual_model import ColumnFit, OutputNoise, ResidualModel
+from sysid.judgement.lagged_products import OutputNoise
+from sysid.judgement.residual_model import ColumnFit, ResidualModel
 from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.kernels.signals.past_reads import is_difference, list_delayed_values
-from sysid.models.model import MAX_SUBSTEPS, Model, replace_substeps
+from sysid.models.model import MAX_SUBSTEPS, replace_substeps
 from sysid.models.ties import collect_parameter_names
 from sysid.residuals.series import ResidualPart, iterate_parts
 from sysid.results.findings import Family, Move
@@ -198,8 +199,14 @@ class ResidualContext:
         steps = _FINER * model.solver.substeps
         if is_difference(model) or steps > MAX_SUBSTEPS:
             return nothing
-        added = self.compute_effect(model=replace_substeps(model, steps))
-        return nothing if added is None else self.weight * added
+        try:
+            finer = self.problem.rebuild(
+                model=replace_substeps(model, steps), weights=self.problem.output_weights
+            )
+        except SysidError:
+            return nothing
+        added = self._predict(finer) - self.simulation
+        return self.weight * added if np.all(np.isfinite(added)) else nothing
 
     @cached_property
     def parameter_numbers(self) -> list[tuple[int, str]]:
@@ -381,25 +388,23 @@ class ResidualContext:
                 shifted[part.rows.start + first : part.rows.stop] = slope[part.rows][:length]
         return shifted
 
-    def simulate(
-        self, records: Sequence[Record] | None = None, model: Model | None = None
-    ) -> FloatArray:
-        """Simulate the scored values (n,) with other inputs or another model.
+    def simulate(self, records: Sequence[Record]) -> FloatArray:
+        """Simulate the scored values (n,) with other inputs, or outputs that are means.
 
         They are ``nan`` if no more simulations are allowed.
         """
-        weights = self.problem.output_weights
-        return self._predict(self.problem.rebuild(records=records, model=model, weights=weights))
+        problem = self.problem
+        if _have_same_times(problem.records, records):
+            return self._predict(problem.replace_inputs(records))
+        return self._predict(problem.rebuild(records=records, weights=problem.output_weights))
 
-    def compute_effect(
-        self, records: Sequence[Record] | None = None, model: Model | None = None
-    ) -> FloatArray | None:
-        """Compute what other inputs or another model add to the simulated values (n,).
+    def compute_effect(self, records: Sequence[Record]) -> FloatArray | None:
+        """Compute what other inputs add to the simulated values (n,), as `simulate` has them.
 
         None if that is nothing, no number, or not to be simulated.
         """
         try:
-            added = self.simulate(records, model) - self.simulation
+            added = self.simulate(records) - self.simulation
         except SysidError:
             return None
         return added if np.all(np.isfinite(added)) and added.any() else None
@@ -589,6 +594,17 @@ class ResidualContext:
                     rows[part.rows] = True
             if rows.any():
                 yield output.name, rows, format_unit(output.unit)
+
+
+def _have_same_times(before: Sequence[Record], after: Sequence[Record]) -> bool:
+    """Return whether records have the same outputs, and inputs at the same times."""
+    return all(
+        all(a is b for a, b in zip(new.outputs, old.outputs, strict=True))
+        and all(
+            np.array_equal(a.times, b.times) for a, b in zip(new.inputs, old.inputs, strict=True)
+        )
+        for old, new in zip(before, after, strict=True)
+    )
 
 
 def read_channel(channel: Channel, times: FloatArray, lag: float = 0.0) -> FloatArray:

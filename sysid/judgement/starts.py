@@ -159,25 +159,29 @@ _NAMES: Mapping[StartKind | None, str] = {
 def find_open_starts(
     comparison: StartComparison | None, estimates: Sequence[Estimate]
 ) -> Iterator[Finding]:
-    """Find other starts that the data do not rule out, and that move an estimate."""
+    """Find other starts that the data do not rule out, and that move an estimate.
+
+    If the data rule the own start out, which was not compared before, the best is told anyway.
+    """
     if comparison is None:
         return
     own = comparison.own
+    known = {one.name: one for one in estimates}
     for fit in comparison.fits[1:]:
         moves = comparison.list_moves(fit, estimates)
         notable = tuple(one.parameter for one in moves if abs(one.stderrs) > NOTABLE_MOVE)
-        if not (fit.is_open and notable):
+        if not fit.is_open or not (notable or (fit is comparison.best and not own.is_open)):
             continue
-        units = {one.name: plain_unit(one.unit) for one in estimates}
         told = [
-            f"{one.parameter} is {plain_estimate(one.value, one.stderr)}{units[one.parameter]}"
+            f"{one.parameter} is {plain_estimate(one.value, one.stderr)}"
+            f"{plain_unit(known[one.parameter].unit)}"
             for one in moves
-            if one.parameter in notable
+            if one.parameter in notable or not notable
         ]
         yield Finding(
             "start",
             "start",
-            "caution",
+            "caution" if notable else "note",
             f"the states may start {_NAMES[fit.name]}",
             f"the estimates assume that the states start {_NAMES[own.name]}. The data do not rule "
             f"out that they start {_NAMES[fit.name]}"

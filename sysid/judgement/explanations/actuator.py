@@ -198,11 +198,14 @@ def _bend(values: FloatArray, middle: float, span: float, power: int) -> FloatAr
 
 def _play(values: FloatArray, width: float) -> FloatArray:
     """Follow values with a play of a width to either side (Krasnosel'skii and Pokrovskii 1989)."""
-    moved, last = np.empty(values.size), float(values[0])
-    for i, value in enumerate(values.tolist()):
-        last = min(max(last, value - width), value + width)
-        moved[i] = last
-    return moved
+    moved, last = list[float](), float(values[0])
+    for value in values.tolist():
+        if last < value - width:
+            last = value - width
+        elif last > value + width:
+            last = value + width
+        moved.append(last)
+    return np.array(moved)
 
 
 def _ignore_small(values: FloatArray, middle: float, width: float) -> FloatArray:
@@ -211,11 +214,16 @@ def _ignore_small(values: FloatArray, middle: float, width: float) -> FloatArray
 
 
 def _limit_rate(values: FloatArray, most: float) -> FloatArray:
-    moved, last = np.empty(values.size), float(values[0])
-    for i, value in enumerate(values.tolist()):
-        last += min(max(value - last, -most), most)
-        moved[i] = last
-    return moved
+    moved, last = list[float](), float(values[0])
+    for value in values.tolist():
+        if value > last + most:
+            last += most
+        elif value < last - most:
+            last -= most
+        else:
+            last = value
+        moved.append(last)
+    return np.array(moved)
 
 
 def _smooth(values: FloatArray, width: int) -> FloatArray:

@@ -246,7 +246,7 @@ def test_moves_on_a_log_scale_keep_the_sign_of_a_value() -> None:
     far = fit.coefficients.copy()
     far[scaled] = -3.0 * fit.errors[scaled]
     (move,) = [
-        one for one in context.compute_moves(fit._replace(coefficients=far)) if one.parameter == "T"
+        one for one in context.compute_moves(replace(fit, coefficients=far)) if one.parameter == "T"
     ]
     assert move.stderr is not None
     assert 0.0 < move.value < value
