@@ -48,7 +48,7 @@ from sysid.judgement.preparation import (
     find_useless_prediction,
 )
 from sysid.judgement.process_order import compare_orders, find_other_orders
-from sysid.judgement.residual_context import find_delay_parameters
+from sysid.judgement.residual_context import Simulations, find_delay_parameters
 from sysid.judgement.settling import find_rough_end, find_unsettled
 from sysid.judgement.starts import StartComparison, find_open_starts
 from sysid.judgement.unrecorded_input import find_unrecorded_input
@@ -188,6 +188,7 @@ def _build_identification(
     measures = compares_orders and not is_white  # beside white residuals nothing is better
     yardstick = fit_yardstick(problem, simulated) if measures else None
     is_of_the_solver = metrics.rms <= SOLVER_SHARE * problem.output_scale
+    simulations = Simulations(budget.count_left(), deadline.is_past_grace)
     findings = order_findings(
         [
             *find_disagreement(metrics, limit, are_residuals_noise=are_noise),
@@ -204,9 +205,11 @@ def _build_identification(
             *find_misled_run(estimates, ahead),
             *select_explanations(
                 () if is_of_the_solver or feedback else explained.findings,
-                [
+                ()
+                if feedback
+                else [
                     *find_other_orders(orders, problem.model.name, estimates),
-                    *find_other_readings(problem, holds, doubts, estimates, rms),
+                    *find_other_readings(problem, holds, doubts, estimates, rms, simulations),
                     *find_open_starts(best.starts, estimates),
                 ],
             ),
@@ -249,6 +252,7 @@ def _build_identification(
         ],
         problem.n_scored,
     )
+    budget.spend(simulations.spent)
     analysis = replace(analysis, estimates=conclude_estimates(estimates, findings))
     declared = [parameter.name for parameter in problem.model.parameters]
     fit = FitPercent(

@@ -1,12 +1,13 @@
 """The judge: which explanations of the residuals are more likely than noise, and what they move."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sysid.core.distributions import chi_square_limit
+from sysid.core.errors import SysidError
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.judgement.explanations import (
@@ -29,10 +30,19 @@ from sysid.judgement.levels import (
     STRONG_ODDS,
     UNLIKELY_MOVE,
 )
-from sysid.judgement.residual_context import CUT_THERE, Candidate, ResidualContext
+from sysid.judgement.residual_context import (
+    CUT_THERE,
+    Candidate,
+    ResidualContext,
+    Simulations,
+)
 from sysid.judgement.residual_model import ColumnFit
 from sysid.kernels.signals.past_reads import is_difference
 from sysid.results.findings import Finding, Move
+from sysid.search.refine import refine_candidates
+from sysid.simulation.problem import Problem
+from sysid.simulation.start_values import convert_point
+from sysid.uncertainty.analysis import analyse_estimate
 
 _PROPOSERS = (
     constancy.propose,
@@ -45,11 +55,13 @@ _COSTLY_PROPOSERS = (actuator.propose, actuator.propose_loads)
 """Each of their explanations takes a simulation: only if the residuals depend on anything."""
 _LIKELY = 0.01  # of the ratio of one candidate: then the costly ones are looked at as well
 _BY_ORDER = ("one more time constant", "filter of a sensor")  # another order is the full fit
+_SETTABLE = ("order", "reading of an input", "start")  # their advice is a setting
 _MOST_SHARE = 0.5  # columns for a sample: with 0.8, noise gains 12 in one of 20 records of 30
 _MOST_FINDINGS = 3  # that are found beside each other
 _MOST_TOLD = 3  # moves in a sentence
 _MOST_RIVALS = 2  # in a sentence
 _MOST_REFITTED = 3  # explanations that are fitted in full
+_FULL_FIT = 30  # steps of least squares of a setting that is tried
 
 
 class _Scored(NamedTuple):
@@ -79,12 +91,13 @@ class Explained(NamedTuple):
         return is_clear and all(one.severity == "note" for one in self.findings)
 
 
-def explain_residuals(context: ResidualContext) -> Explained:
+def explain_residuals(context: ResidualContext, *, advises: bool = True) -> Explained:
     """Explain the residuals of an estimate by the likeliest explanations, the largest gain first.
 
     The likeliest one is taken, then the likeliest beside it, as long as one gains clearly
     (stepwise by Schwarz's criterion). One that is taken twice, such as a limit at two levels, is
-    told once. If no simulations are left for some explanations, it is not done.
+    told once. If no simulations are left for some explanations, it is not done. If it `advises`,
+    settings that help are tried first.
     """
     if not (_is_possible(context) and np.all(np.isfinite(context.simulation))):
         return Explained(is_doubtful=context.simulations.is_cut_short)
@@ -110,7 +123,10 @@ def explain_residuals(context: ResidualContext) -> Explained:
             and one.candidate.explanation != best.candidate.explanation
         ]
         if all(one.brief != best.candidate.brief for one in findings):
-            findings.append(_describe(context, best, before, rivals))
+            found = _describe(context, best, before, rivals)
+            is_tried = advises and found.advice and best.candidate.remedy
+            is_vain = is_tried and (rivals or not _is_cured(context, best.candidate.remedy))
+            findings.append(replace(found, advice="") if is_vain else found)
         if best.moves is not None:
             break  # the estimate is another one then
         taken = np.hstack([taken, best.candidate.columns])
@@ -282,6 +298,35 @@ def _describe(
     )
 
 
+def _is_cured(context: ResidualContext, changes: Mapping[str, Any]) -> bool:
+    """Return whether the model leaves nothing but noise once the problem is changed."""
+    problem = context.problem
+    try:
+        other = problem.rebuild(**{"weights": problem.output_weights, **changes})
+    except SysidError:
+        return False
+    return leaves_noise(other, convert_point(problem, other, context.theta), context.simulations)
+
+
+def leaves_noise(problem: Problem, start: FloatArray, simulations: Simulations) -> bool:
+    """Fit a problem in full from a start (D,), and judge whether nothing but noise is left.
+
+    That is what makes an alternative of an explanation: only then its estimates are better. False
+    if simulations do not suffice, or if an estimate ends at a bound.
+    """
+    if not simulations.allow(2 * _FULL_FIT * (start.size + 1)):
+        return False
+    (end,) = refine_candidates(problem, [start], _FULL_FIT * (start.size + 1), simulations.is_late)
+    if end is None:
+        return False
+    analysis = analyse_estimate(problem, end.theta)
+    simulations.spent += end.evaluations + analysis.evaluations
+    if any(one.status == "at bound" for one in analysis.estimates):
+        return False
+    context = ResidualContext(problem, end.theta, analysis, simulations)
+    return explain_residuals(context, advises=False).is_noise
+
+
 def _is_large(context: ResidualContext, best: _Scored) -> bool:
     """Whether an explanation is too large for its moves to be linear: no parameter is safe then.
 
@@ -315,7 +360,8 @@ def select_explanations(
     Each of them was compared with the model alone, so they compete. Those with strong evidence
     against them, beside the likeliest one, are left out. What was found beside the likeliest one
     stays with it. Another order that was fitted in full takes the place of its columns.
-    Explanations of the noise compete with none of them, and always stay.
+    Explanations of the noise compete with none of them, and always stay. A setting is advised only
+    if nothing competes with it.
     """
     if any(one.explanation == "order" and (one.gain or 0.0) > DEFECT_GAIN for one in refitted):
         explained = [one for one in explained if one.explanation not in _BY_ORDER]
@@ -326,5 +372,20 @@ def select_explanations(
     other = max((one.gain or 0.0 for one in refitted), default=0.0)
     kept = [one for one in refitted if one.gain is None or (one.gain or 0.0) > first - STRONG_ODDS]
     if other - first > STRONG_ODDS:
-        return (*of_noise, *kept)
-    return (*explained, *kept)
+        return (*of_noise, *_leave_out_rival_settings(kept))
+    return _leave_out_rival_settings([*explained, *kept])
+
+
+def _leave_out_rival_settings(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Leave out the settings of findings that others, without strong evidence, compete with."""
+    gains = [(one.explanation, one.gain) for one in findings if not one.is_of_noise]
+    return tuple(
+        replace(one, advice="")
+        if one.explanation in _SETTABLE
+        and any(
+            name != one.explanation and gain is not None and gain > (one.gain or 0.0) - STRONG_ODDS
+            for name, gain in gains
+        )
+        else one
+        for one in findings
+    )

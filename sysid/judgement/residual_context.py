@@ -1,9 +1,9 @@
 """What explanations of residuals start from: residuals, sensitivities, and the model itself."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -70,6 +70,8 @@ class Candidate:
         Whether it leaves open what the model lacks: then no parameter is safe.
     is_added : bool
         Whether it adds to the output whatever the parameters are, such as a drift of the sensor.
+    remedy : mapping of str to object
+        Changes of the problem that the advice makes, if it is a setting: `Problem.rebuild`.
     """
 
     explanation: str
@@ -86,6 +88,7 @@ class Candidate:
     doubtful: Collection[str] = ()
     is_vague: bool = False
     is_added: bool = False
+    remedy: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(eq=False)

@@ -16,7 +16,7 @@ from sysid.core.errors import SysidError
 from sysid.data.records import Channel, History, Record
 from sysid.judgement.residual_context import CUT_THERE, Candidate, ResidualContext
 from sysid.judgement.start_slopes import list_assumed_starts
-from sysid.judgement.unrecorded_input import compute_reach
+from sysid.judgement.unrecorded_input import compute_reach, find_assumed_samples
 
 _SPANS = 4  # of the time that lags reach back before the record
 
@@ -30,17 +30,25 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
     yield from inputs
     yield from _propose_restarts(context)
     states, slopes = list_assumed_starts(problem), context.fixed_start_slopes
-    for before in (np.zeros((context.times.size, 0)), *(one.columns for one in inputs)):
-        if slopes:
-            yield Candidate(
-                "start",
-                "start",
-                np.hstack([*slopes, before]),
-                "the record does not start as the model says",
-                f"the record does not start where the model says that {', '.join(states)} does",
-                "Use initial: free.",
-                is_added=True,
-            )
+    for before in (None, *inputs) if slopes else ():
+        columns = [] if before is None else [before.columns]
+        skipped = 0 if before is None else _count_assumed(context)
+        yield Candidate(
+            "start",
+            "start",
+            np.hstack([*slopes, *columns]),
+            "the record does not start as the model says",
+            f"the record does not start where the model says that {', '.join(states)} does",
+            f"Use initial: free and skip: {skipped}." if skipped else "Use initial: free.",
+            is_added=True,
+            remedy={"initial": "free", **({"skip": skipped} if skipped else {})},
+        )
+
+
+def _count_assumed(context: ResidualContext) -> int:
+    """Count the samples that read an input from before the record, at most of an output."""
+    parts = find_assumed_samples(context.problem, context.analysis)
+    return max(int(np.count_nonzero(part)) for part in parts)
 
 
 def _propose_restarts(context: ResidualContext) -> Iterator[Candidate]:

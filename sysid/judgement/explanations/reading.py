@@ -59,6 +59,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                     f"the data say that {name} {text}",
                     setting,
                     records=records,
+                    remedy={"records": records} if is_sure else {},
                 )
     yield from _propose_means(context)
 
