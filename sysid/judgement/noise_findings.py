@@ -85,8 +85,12 @@ def find_unexplained(
             "structure",
             "caution",
             f"the residuals depend on {names}",
-            f"the residuals on the {tests.data} data depend on {names}: a part of the response is "
-            "missing from the model, or it does not hold there.",
+            f"the residuals on the {tests.data} data depend on {names}: "
+            + (
+                "the model does not hold there, or its estimates are not exact enough for them."
+                if tests.data == "validation"
+                else "a part of the response is missing from the model."
+            ),
         )
     elif failed and not explained.is_done:
         yield Finding(
