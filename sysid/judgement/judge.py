@@ -44,9 +44,9 @@ from sysid.simulation.problem import Problem
 from sysid.simulation.start_values import convert_point
 from sysid.uncertainty.analysis import analyse_estimate
 
+_FREE_PROPOSERS = (constancy.propose, sensor.propose)
 _PROPOSERS = (
-    constancy.propose,
-    sensor.propose,
+    *_FREE_PROPOSERS,
     structure.propose,
     history.propose,
     reading.propose,
@@ -95,9 +95,9 @@ def explain_residuals(context: ResidualContext, *, advises: bool = True) -> Expl
     """Explain the residuals of an estimate by the likeliest explanations, the largest gain first.
 
     The likeliest one is taken, then the likeliest beside it, as long as one gains clearly
-    (stepwise by Schwarz's criterion). One that is taken twice, such as a limit at two levels, is
-    told once. If no simulations are left for some explanations, it is not done. If it `advises`,
-    settings that help are tried first.
+    (stepwise by Schwarz's criterion). Beside another it gains no more than that. One that is taken
+    twice, such as a limit at two levels, is told once. If no simulations are left for some
+    explanations, it is not done. If it `advises`, settings are tried.
     """
     if not (_is_possible(context) and np.all(np.isfinite(context.simulation))):
         return Explained(is_doubtful=context.simulations.is_cut_short)
@@ -132,13 +132,23 @@ def explain_residuals(context: ResidualContext, *, advises: bool = True) -> Expl
         taken = np.hstack([taken, best.candidate.columns])
         counted += best.candidate.counted
         base = before = best.fit
-        candidates = [one.candidate for one in scored if one.gain > DEFECT_GAIN][1:]
-        scored = _score(context, candidates, taken, counted, base.criterion)
+        candidates = _propose_beside(context.take(taken), [one.candidate for one in scored[1:]])
+        scored = [
+            one._replace(gain=min(one.gain, best.gain))
+            for one in _score(context, candidates, taken, counted, base.criterion)
+        ]
     findings += find_noise(context, base)
     if not findings:
         findings += find_disagreement_of_frequencies(context)
     is_cut_short = context.simulations.is_cut_short
     return Explained(tuple(findings), not is_cut_short, is_doubtful or is_cut_short)
+
+
+def _propose_beside(beside: ResidualContext, others: Sequence[Candidate]) -> list[Candidate]:
+    """Propose anew what takes no simulation, such as other moments of a change; keep the rest."""
+    anew = list(_list_candidates(beside, _FREE_PROPOSERS))
+    names = {one.explanation for one in anew}
+    return [*anew, *(one for one in others if one.explanation not in names)]
 
 
 def _is_possible(context: ResidualContext) -> bool:

@@ -1,6 +1,7 @@
 """What explanations of residuals start from: residuals, sensitivities, and the model itself."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -189,6 +190,14 @@ class ResidualContext:
             return plain
         exact = ResidualModel(-error - self._integration_error, columns, self.parts)
         return min(exact, plain, key=lambda model: model.without.criterion)
+
+    def take(self, columns: FloatArray) -> "ResidualContext":
+        """Return the context beside columns (n, q), as if they were those of parameters."""
+        other, model = copy(self), self.residual_model
+        joined = np.hstack([model.columns, columns])
+        vars(other)["residual_model"] = ResidualModel(model.residuals, joined, self.parts)
+        vars(other).pop("_bases", None)
+        return other
 
     @cached_property
     def _integration_error(self) -> FloatArray:
