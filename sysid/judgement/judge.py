@@ -86,7 +86,12 @@ class Explained(NamedTuple):
 
     @property
     def is_noise(self) -> bool:
-        """Whether no explanation has strong odds against noise alone, or moves an estimate."""
+        """Whether no explanation but those of noise has strong odds against it."""
+        return self.is_sound and all(one.is_of_noise for one in self.findings)
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether no explanation moves an estimate, and none was left out."""
         is_clear = self.is_done and not self.is_doubtful
         return is_clear and all(one.severity == "note" for one in self.findings)
 
@@ -319,7 +324,7 @@ def _is_cured(context: ResidualContext, changes: Mapping[str, Any]) -> bool:
 
 
 def leaves_noise(problem: Problem, start: FloatArray, simulations: Simulations) -> bool:
-    """Fit a problem in full from a start (D,), and judge whether nothing but noise is left.
+    """Fit a problem in full from a start (D,), and judge whether nothing is left that moves it.
 
     That is what makes an alternative of an explanation: only then its estimates are better. False
     if simulations do not suffice, or if an estimate ends at a bound.

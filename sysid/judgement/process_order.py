@@ -157,7 +157,7 @@ def _judge_fit(
     """Judge whether the fit of a model tells its dead time, and leaves nothing but noise."""
     delay = next(one for one in context.analysis.estimates if one.name == "L")
     leaves_noise = (
-        delay.status == "identified" and explain_residuals(context, advises=False).is_noise
+        delay.status == "identified" and explain_residuals(context, advises=False).is_sound
     )
     fits = tuple(
         replace(fit, leaves_noise=leaves_noise) if fit.model == model else fit

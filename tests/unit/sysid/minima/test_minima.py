@@ -160,7 +160,6 @@ def test_an_assumed_input_is_told_once(wrongly_assumed: Identification) -> None:
     assert sum("assumed" in text for text in wrongly_assumed.warnings) == 1
 
 
-@pytest.mark.xfail(strict=True, reason="what gains 383 and moves nothing is taken for noise")
 def test_an_assumed_input_is_no_noise(wrongly_assumed: Identification) -> None:
     assert wrongly_assumed.noise_model == "white"
 
