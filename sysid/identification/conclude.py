@@ -217,7 +217,9 @@ def _build_identification(
             *find_open_terms(estimates, problem.model),
             *find_undetermined(problem, analysis, delays, are_residuals_noise=are_noise),
             *find_early_responses(problem),
-            *find_unrecorded_input(problem, analysis, is_contradicted=minima.is_contradicted),
+            *find_unrecorded_input(
+                problem, analysis, explained.findings, is_contradicted=minima.is_contradicted
+            ),
             *(() if is_of_the_solver else find_unexplained(tests, explained, analysis)),
             *feedback,
             *find_unit_faults(problem),

@@ -1,8 +1,8 @@
 """The judge: which explanations of the residuals are more likely than noise, and what they move."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -129,9 +129,8 @@ def explain_residuals(context: ResidualContext, *, advises: bool = True) -> Expl
         ]
         if all(one.brief != best.candidate.brief for one in findings):
             found = _describe(context, best, before, rivals)
-            is_tried = advises and found.advice and best.candidate.remedy
-            is_vain = is_tried and (rivals or not _is_cured(context, best.candidate.remedy))
-            findings.append(replace(found, advice="") if is_vain else found)
+            is_tried = advises and not rivals
+            findings.append(_try_setting(context, best.candidate, found) if is_tried else found)
         if best.moves is not None:
             break  # the estimate is another one then
         taken = np.hstack([taken, best.candidate.columns])
@@ -306,21 +305,29 @@ def _describe(
         "caution" if parameters else "note",
         candidate.brief,
         text,
-        candidate.advice if parameters or candidate.family == "start" else "",
+        candidate.advice if parameters else "",
         best.gain,
         moves,
         parameters,
     )
 
 
-def _is_cured(context: ResidualContext, changes: Mapping[str, Any]) -> bool:
-    """Return whether the model leaves nothing but noise once the problem is changed."""
-    problem = context.problem
+def _try_setting(context: ResidualContext, candidate: Candidate, finding: Finding) -> Finding:
+    """Advise the setting of an explanation if nothing but noise is left with it.
+
+    One that moves nothing needs no setting, but for the start: its errors are too small.
+    """
+    if not candidate.setting or (finding.severity == "note" and candidate.family != "start"):
+        return finding
+    problem, changes = context.problem, candidate.remedy
     try:
         other = problem.rebuild(**{"weights": problem.output_weights, **changes})
     except SysidError:
-        return False
-    return leaves_noise(other, convert_point(problem, other, context.theta), context.simulations)
+        return finding
+    start = convert_point(problem, other, context.theta)
+    if not leaves_noise(other, start, context.simulations):
+        return finding
+    return replace(finding, advice=f"{finding.advice} {candidate.setting}".lstrip())
 
 
 def leaves_noise(problem: Problem, start: FloatArray, simulations: Simulations) -> bool:
@@ -339,7 +346,7 @@ def leaves_noise(problem: Problem, start: FloatArray, simulations: Simulations) 
     if any(one.status == "at bound" for one in analysis.estimates):
         return False
     context = ResidualContext(problem, end.theta, analysis, simulations)
-    return explain_residuals(context, advises=False).is_noise
+    return explain_residuals(context, advises=False).is_sound
 
 
 def _is_large(context: ResidualContext, best: _Scored) -> bool:

@@ -71,8 +71,10 @@ class Candidate:
         Whether it leaves open what the model lacks: then no parameter is safe.
     is_added : bool
         Whether it adds to the output whatever the parameters are, such as a drift of the sensor.
+    setting : str
+        Advice that is a setting: told after it was tried.
     remedy : mapping of str to object
-        Changes of the problem that the advice makes, if it is a setting: `Problem.rebuild`.
+        What the setting changes in the problem, as `Problem.rebuild` takes it.
     """
 
     explanation: str
@@ -89,6 +91,7 @@ class Candidate:
     doubtful: Collection[str] = ()
     is_vague: bool = False
     is_added: bool = False
+    setting: str = ""
     remedy: Mapping[str, Any] = field(default_factory=dict)
 
 

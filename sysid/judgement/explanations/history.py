@@ -16,7 +16,7 @@ from sysid.core.errors import SysidError
 from sysid.data.records import Channel, History, Record
 from sysid.judgement.residual_context import CUT_THERE, Candidate, ResidualContext
 from sysid.judgement.start_slopes import list_assumed_starts
-from sysid.judgement.unrecorded_input import compute_reach, find_assumed_samples
+from sysid.judgement.unrecorded_input import GIVE_HISTORY, compute_reach, find_assumed_samples
 
 _SPANS = 4  # of the time that lags reach back before the record
 
@@ -39,8 +39,8 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             np.hstack([*slopes, *columns]),
             "the record does not start as the model says",
             f"the record does not start where the model says that {', '.join(states)} does",
-            f"Use initial: free and skip: {skipped}." if skipped else "Use initial: free.",
             is_added=True,
+            setting=f"Use initial: free and skip: {skipped}." if skipped else "Use initial: free.",
             remedy={"initial": "free", **({"skip": skipped} if skipped else {})},
         )
 
@@ -82,7 +82,7 @@ def _propose_restarts(context: ResidualContext) -> Iterator[Candidate]:
 
 def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:
     """Propose that an input was elsewhere before its first sample."""
-    reach = compute_reach(context.problem, context.analysis)
+    reach, skipped = compute_reach(context.problem, context.analysis), _count_assumed(context)
     for name in context.inputs if reach > 0 else ():
         columns = []
         for span in range(_SPANS):
@@ -96,9 +96,12 @@ def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:
                 "history",
                 context.weigh(np.column_stack(moved)),
                 f"{name} moved before the record",
-                f"{name} was not at its first value before the record, as is assumed",
-                "Begin the record earlier, or leave its first samples out with skip.",
+                f"{name} was not at its first value before the record. Its first value is assumed "
+                "there, and the data contradict it",
+                GIVE_HISTORY,
                 is_added=True,
+                setting=f"Or use skip: {skipped}.",
+                remedy={"skip": skipped},
             )
 
 

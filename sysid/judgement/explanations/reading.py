@@ -50,16 +50,15 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             moved = other - context.simulation
             if np.all(np.isfinite(moved)) and moved.any():
                 is_sure = change is _keep and channel.sampling.is_regular
-                setting = f"Use hold: {{{name}: {hold}}}." if is_sure else ""
                 yield Candidate(
                     "reading of an input",
                     "reading",
                     context.weigh(moved),
                     f"{name} is better read {word}",
                     f"the data say that {name} {text}",
-                    setting,
                     records=records,
-                    remedy={"records": records} if is_sure else {},
+                    setting=f"Use hold: {{{name}: {hold}}}." if is_sure else "",
+                    remedy={"records": records},
                 )
     yield from _propose_means(context)
 
