@@ -7,10 +7,10 @@
 
 The kinds are in `benchmarks/judgement_kinds.py`, the plants in `benchmarks/judgement_plants.py`.
 Nothing is set but the model. A parameter is wrong if its status is `identified` and its value is
-more than four standard errors from a value that was true in some part of the record. The reason is
-true if the first finding is of a family, or an explanation, that the kind names. Advice that is a
-setting or a model is followed. It made an estimate worse if an error grew by over one standard
-error.
+more than four standard errors from a value that was true in some part of the record. A verdict
+names up to two causes. Its reason is true if one of them is of a family, or an explanation, that
+the kind names. Advice that is a setting or a model is followed. It made an estimate worse if an
+error grew by over one standard error.
 """
 
 import argparse
@@ -81,7 +81,11 @@ class Advised:
 
 @dataclass(frozen=True)
 class Answer:
-    """What was said of one record; `trust` is empty if it was refused, `crash` names a fault."""
+    """What was said of one record; `trust` is empty if it was refused, `crash` names a fault.
+
+    `is_reason_true` says whether the verdict names the true reason, `is_first_true` whether that is
+    what it names first.
+    """
 
     kind: str
     seed: int
@@ -91,6 +95,7 @@ class Answer:
     estimates: Mapping[str, Judged]
     findings: tuple[Mapping[str, Any], ...]
     is_reason_true: bool
+    is_first_true: bool
     detectable: bool
     advised: Advised | None
     refused: str
@@ -158,6 +163,7 @@ def judge_case(task: tuple[str, int]) -> Answer:
         "estimates": {},
         "findings": (),
         "is_reason_true": False,
+        "is_first_true": False,
         "detectable": False,
         "advised": None,
         "refused": "",
@@ -175,7 +181,8 @@ def judge_case(task: tuple[str, int]) -> Answer:
 def _tell_answer(case: Case) -> dict[str, Any]:
     found = identify_as_command(case.model, case.recording)
     findings = found.findings
-    first = findings[0] if findings else None
+    named = [one for one in findings if one.brief in found.verdict.text]
+    true = [one for one in named if case.kind.reasons & {one.family, one.explanation}]
     estimates = compare_truth(found, case)
     settings = read_advice(found)
     return {
@@ -183,8 +190,8 @@ def _tell_answer(case: Case) -> dict[str, Any]:
         "verdict": found.verdict.text,
         "estimates": estimates,
         "findings": tuple(map(_describe_finding, findings)),
-        "is_reason_true": first is not None
-        and bool(case.kind.reasons & {first.family, first.explanation}),
+        "is_reason_true": bool(true),
+        "is_first_true": bool(true) and true[0] is findings[0],
         "detectable": is_detectable(case, found),
         "advised": follow_advice(case, estimates, settings) if settings else None,
     }
@@ -402,6 +409,13 @@ def count_answers(answers: Sequence[Answer]) -> list[Row | Skipped]:
             [one for one in hedged if one.is_reason_true],
             hedged,
             75.0,
+            ">=",
+        ),
+        share_row(
+            "of these, as the first cause",
+            [one for one in hedged if one.is_first_true],
+            hedged,
+            None,
             ">=",
         ),
         share_row(

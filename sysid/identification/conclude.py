@@ -185,10 +185,23 @@ def _build_identification(
         run_residual_tests(problem, simulated, "estimation") if any(times.values()) else tests,
     )
     is_white = analysis.uncertainty is None or analysis.uncertainty.noise_colour == "white"
-    measures = compares_orders and not is_white  # beside white residuals nothing is better
+    # Beside white residuals nothing is better, and in a loop the controller's inverse is.
+    measures = compares_orders and not is_white and not feedback
     yardstick = fit_yardstick(problem, simulated) if measures else None
     is_of_the_solver = metrics.rms <= SOLVER_SHARE * problem.output_scale
     simulations = Simulations(budget.count_left(), deadline.is_past_grace)
+    explanations = (
+        ()
+        if feedback
+        else select_explanations(
+            () if is_of_the_solver else explained.findings,
+            [
+                *find_other_orders(orders, problem.model.name, estimates),
+                *find_other_readings(problem, holds, doubts, estimates, rms, simulations),
+                *find_open_starts(best.starts, estimates),
+            ],
+        )
+    )
     findings = order_findings(
         [
             *find_disagreement(metrics, limit, are_residuals_noise=are_noise),
@@ -196,29 +209,20 @@ def _build_identification(
             *find_better_yardstick(
                 yardstick,
                 [one.name for one in estimates if one.is_free],
-                is_explained=any(one.gain for one in explained.findings),
+                explanations,
             ),
             *find_unsettled(
                 evidence, estimates, lambda: find_cause_in_bounds(problem, theta, analysis)
             ),
             *find_contradictions(problem, metrics, validated, estimates),
             *find_misled_run(estimates, ahead),
-            *select_explanations(
-                () if is_of_the_solver or feedback else explained.findings,
-                ()
-                if feedback
-                else [
-                    *find_other_orders(orders, problem.model.name, estimates),
-                    *find_other_readings(problem, holds, doubts, estimates, rms, simulations),
-                    *find_open_starts(best.starts, estimates),
-                ],
-            ),
+            *explanations,
             *find_ambiguous(estimates),
             *find_open_terms(estimates, problem.model),
             *find_undetermined(problem, analysis, delays, are_residuals_noise=are_noise),
             *find_early_responses(problem),
             *find_unrecorded_input(
-                problem, analysis, explained.findings, is_contradicted=minima.is_contradicted
+                problem, analysis, explanations, is_contradicted=minima.is_contradicted
             ),
             *(() if is_of_the_solver else find_unexplained(tests, explained, analysis)),
             *feedback,

@@ -8,7 +8,7 @@ import numpy as np
 from sysid.core.distributions import chi_square_limit
 from sysid.core.text import join_names
 from sysid.core.units import format_unit
-from sysid.judgement.levels import UNLIKELY
+from sysid.judgement.levels import STRONG_ODDS, UNLIKELY
 from sysid.judgement.yardstick import Yardstick
 from sysid.results.findings import Finding, Severity
 from sysid.simulation.fit_metrics import ChannelMetrics, Metrics
@@ -57,15 +57,21 @@ def find_disagreement(
 
 
 def find_better_yardstick(
-    yardstick: Yardstick | None, names: Sequence[str], *, is_explained: bool
+    yardstick: Yardstick | None, names: Sequence[str], explanations: Sequence[Finding]
 ) -> Iterator[Finding]:
     """Find a linear black box that predicts left-out blocks clearly better than the model.
 
-    It says that the model fails, not why. So beside an explanation (`is_explained`) it is a note
-    without advice: that of the explanation helps.
+    It says that the model fails, not why. So beside an explanation that gains more, or that is a
+    clear doubt already, it is a note without advice: that of the explanation helps.
     """
     if yardstick is None or not yardstick.is_clearly_better:
         return
+    gain = 2.0 * yardstick.gain
+    is_explained = any(
+        (one.gain or 0.0) > (gain if one.severity == "note" else STRONG_ODDS)
+        for one in explanations
+        if not one.is_of_noise
+    )
     own, other = yardstick.own_fit_percent, yardstick.fit_percent
     yield Finding(
         "linear black box",
@@ -75,7 +81,7 @@ def find_better_yardstick(
         f"a linear model of order {yardstick.order} explains {other:.1f} % of {yardstick.output} "
         f"in blocks that were left out of it. This model explains {own:.1f} % of the same samples.",
         "" if is_explained else "Choose another model, or look at channels and bounds.",
-        None if is_explained else 2.0 * yardstick.gain,
+        None if is_explained else gain,
         parameters=() if is_explained else tuple(names),
     )
 

@@ -7,9 +7,14 @@ import numpy as np
 import pytest
 
 from sysid.data.records import Channel, Record
-from sysid.judgement.agreement import find_constant_outputs, find_disagreement
+from sysid.judgement.agreement import (
+    find_better_yardstick,
+    find_constant_outputs,
+    find_disagreement,
+)
+from sysid.judgement.yardstick import Yardstick
 from sysid.models.parse import parse_model
-from sysid.results.findings import Finding
+from sysid.results.findings import Finding, Severity
 from sysid.simulation.fit_metrics import ChannelMetrics, Metrics
 from sysid.simulation.problem import Problem
 from tests.support.library.judged_records import N, make_record
@@ -121,3 +126,29 @@ def test_one_constant_output_of_two_is_a_caution() -> None:
     both = Record(record.inputs, (y, Channel("z", y.times, np.full(N, 2.0))))
     (found,) = find_constant_outputs(Problem.build(model, [both], weights={"y": 1.0, "z": 1.0}))
     assert (found.severity, found.brief) == ("caution", "z is constant")
+
+
+def explain_yardstick(*explanations: Finding, gain: float = 54.4) -> Finding:
+    """Compare a model of 81 % with a linear one of 93 %, beside explanations of its residuals."""
+    yardstick = Yardstick("y", 4, {"u": 1.0}, 300, 93.2, 81.3, 0.07, 0.2, gain)
+    (found,) = find_better_yardstick(yardstick, ["K", "L"], explanations)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "severity", "gain", "expected"),
+    [
+        ("unequal variance", "note", 200.0, "caution"),  # of the noise: no reason for a misfit
+        ("jump of the states", "note", 22.3, "caution"),  # explains less than the linear model
+        ("start", "note", 195.0, "note"),
+        ("order", "caution", 15.0, "note"),
+        ("order", "caution", 1.0, "caution"),  # as likely as the model, and no better
+    ],
+)
+def test_a_better_linear_model_is_a_doubt_unless_something_tells_why(
+    name: str, severity: Severity, gain: float, expected: str
+) -> None:
+    explanation = Finding(name, "structure", severity, name, f"{name}.", gain=gain)
+    found = explain_yardstick(explanation)
+    assert (found.severity, bool(found.parameters)) == (expected, expected == "caution")
+    assert explain_yardstick().severity == "caution"
