@@ -154,10 +154,13 @@ def compare_orders(
 def _judge_fit(
     comparison: OrderComparison, model: str, context: ResidualContext
 ) -> OrderComparison:
-    """Judge whether the fit of a model tells its dead time, and leaves nothing but noise."""
-    delay = next(one for one in context.analysis.estimates if one.name == "L")
+    """Judge whether the fit of a model tells all its parameters, and leaves nothing but noise.
+
+    Time constants that end as equals, in a group, are those of a model with still more of them.
+    """
     leaves_noise = (
-        delay.status == "identified" and explain_residuals(context, advises=False).is_sound
+        all(one.status == "identified" for one in context.analysis.estimates if one.is_free)
+        and explain_residuals(context, advises=False).is_sound
     )
     fits = tuple(
         replace(fit, leaves_noise=leaves_noise) if fit.model == model else fit

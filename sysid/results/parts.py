@@ -130,8 +130,8 @@ class OrderFit:
     is_open : bool
         Whether its BIC is within 6 of the lowest: no strong evidence against it.
     leaves_noise : bool
-        Whether it tells the dead time and leaves nothing but noise. Only of the preferred order
-        this is looked for.
+        Whether it tells all its parameters and leaves nothing but noise. Only of the preferred
+        order this is looked for.
     """
 
     model: str
