@@ -100,13 +100,18 @@ def find_unexplained(
             "the residuals are not noise",
             f"the residuals on the {tests.data} data are not white, and why was not looked for.",
         )
-    uncertainty = analysis.uncertainty
-    if uncertainty is not None and uncertainty.noise_colour in ("coloured", "drifting"):
-        is_drifting = uncertainty.noise_colour == "drifting"
+    colour = "" if analysis.uncertainty is None else analysis.uncertainty.noise_colour
+    if colour == "drifting":
+        yield Finding(
+            "coloured noise",
+            "noise",
+            "caution",
+            "the residuals drift over the whole record",
+            "the residuals drift over the whole record, so the standard errors are too small.",
+        )
+    elif colour == "coloured":
         yield note(
             "coloured noise",
             "noise",
-            "the residuals drift over the whole record, so the standard errors are too small"
-            if is_drifting
-            else "the noise is coloured, and the standard errors allow for it",
+            "the noise is coloured, and the standard errors allow for it",
         )
