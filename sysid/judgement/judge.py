@@ -220,7 +220,7 @@ def _order(scored: Sequence[_Scored]) -> list[_Scored]:
 def _refit_finalists(
     context: ResidualContext, scored: Sequence[_Scored], criterion: float
 ) -> list[_Scored]:
-    """Fit in full the likeliest explanations of which each is another record.
+    """Fit in full the likeliest explanations of which each is another record or start.
 
     They may move the parameters by far more than a linear step.
     """
@@ -229,13 +229,14 @@ def _refit_finalists(
         name = one.candidate.explanation
         if len(tried) == _MOST_REFITTED or one.gain <= 0.0:
             break
-        if one.candidate.records is None or name in tried:
+        if name in tried or not one.candidate.is_refitted:
             continue
         tried[name] = position
-        found = context.refit(one.candidate.records)
+        found = context.refit(one.candidate.change)
         if found is None:
             continue
-        used = (1 + one.candidate.counted) * np.log(max(context.times.size, 2))
+        added = one.candidate.columns.shape[1] + one.candidate.counted
+        used = added * np.log(max(context.times.size, 2))
         gain = float(criterion - found.criterion - used)
         if gain > one.gain - STRONG_ODDS:
             refitted[position] = one._replace(gain=max(gain, one.gain), moves=found.moves)
@@ -319,7 +320,7 @@ def _try_setting(context: ResidualContext, candidate: Candidate, finding: Findin
     """
     if not candidate.setting or (finding.severity == "note" and candidate.family != "start"):
         return finding
-    problem, changes = context.problem, candidate.remedy
+    problem, changes = context.problem, candidate.change
     try:
         other = problem.rebuild(**{"weights": problem.output_weights, **changes})
     except SysidError:

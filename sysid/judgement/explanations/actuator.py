@@ -62,7 +62,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                     change.brief,
                     change.text,
                     counted=1,
-                    records=records,
+                    change={"records": records},
                     is_vague=change.family == "input",
                 )
         direct = context.read_input(name)

@@ -41,7 +41,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             f"the record does not start where the model says that {', '.join(states)} does",
             is_added=True,
             setting=f"Use initial: free and skip: {skipped}." if skipped else "Use initial: free.",
-            remedy={"initial": "free", **({"skip": skipped} if skipped else {})},
+            change={"initial": "free", **({"skip": skipped} if skipped else {})},
         )
 
 
@@ -101,7 +101,7 @@ def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:
                 GIVE_HISTORY,
                 is_added=True,
                 setting=f"Or use skip: {skipped}.",
-                remedy={"skip": skipped},
+                change={"skip": skipped},
             )
 
 

@@ -56,9 +56,8 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                     context.weigh(moved),
                     f"{name} is better read {word}",
                     f"the data say that {name} {text}",
-                    records=records,
                     setting=f"Use hold: {{{name}: {hold}}}." if is_sure else "",
-                    remedy={"records": records},
+                    change={"records": records},
                 )
     yield from _propose_means(context)
 
