@@ -44,7 +44,7 @@ from tests.support.source_facts import list_modules
 
 OPEN = "…"
 """Stands in a text for what is known when it is written."""
-VALUES = {
+VALUES: dict[tuple[str, str], list[tuple[str, ...]]] = {
     ("hold", OPEN): [("u", hold) for hold in HOLDS],
     ("loss", "scale"): [("scale", "0.3")],
 }
@@ -86,7 +86,9 @@ def fill(match: re.Match[str]) -> Iterator[str]:
         yield match[0]
         return
     entries = [entry.split(": ") for entry in match["entries"].split(", ")]
-    choices = [VALUES.get((match["field"], name), [(name, value)]) for name, value in entries]
+    choices: list[list[tuple[str, ...]]] = [
+        VALUES.get((match["field"], name), [(name, value)]) for name, value in entries
+    ]
     for filled in product(*choices):
         yield f"{match['field']}: {{{', '.join(map(': '.join, filled))}}}"
 
