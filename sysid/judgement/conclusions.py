@@ -28,7 +28,12 @@ _MOST_GAIN = 100.0  # that tells from a larger one: the odds are beyond any doub
 _MOST_REASONS = 2  # of an estimate, and in a verdict
 
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
-_OF_RECORD = ("constant output", "constant input", "feedback")  # nothing else says anything then
+_OF_RECORD = (
+    "constant output",
+    "constant input",
+    "exchanged channels",
+    "feedback",
+)  # then nothing else says anything
 _FAILURES = ("constant", "little fit", "straight line")
 _LACKS = ("no information", "combination", "bound", "other minimum", "no time lag")
 """What the data do not tell. What is known of the record, and of its noise, may be why."""
