@@ -56,7 +56,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                     change.brief,
                     change.text,
                     counted=1,
-                    records=records,
+                    change={"records": records},
                     is_vague=change.family == "input",
                 )
         direct = context.read_input(name)
@@ -73,13 +73,16 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
 def propose_loads(context: ResidualContext) -> Iterator[Candidate]:
     """Propose a load that begins to act at the input of the plant where an innovation is large.
 
-    An input acts after its time lag, so the load began by so much earlier.
+    An input acts after its time lag, so the load began by so much earlier. One that began before
+    the record is where the plant starts.
     """
     reach = compute_reach(context.problem, context.analysis)
     for channel, position in product(context.moving_inputs[:1], context.find_shocks()):
         begin = float(context.times[position]) - reach
         experiment = context.find_experiment(position)
         records = list(context.problem.records)
+        if begin <= records[experiment].start:
+            continue
         records[experiment] = _add_step(
             records[experiment], channel.name, begin, float(np.ptp(channel.values))
         )
