@@ -401,11 +401,15 @@ class ResidualContext:
         return shifted
 
     def simulate(self, records: Sequence[Record]) -> FloatArray:
-        """Simulate the scored values (n,) with other inputs.
+        """Simulate the scored values (n,) with other inputs, or other holds of the outputs.
 
         They are ``nan`` if no more simulations are allowed.
         """
-        return self._predict(self.problem.replace_inputs(records))
+        pairs = zip(self.problem.records, records, strict=True)
+        if all(_differ_in_inputs_only(before, after) for before, after in pairs):
+            return self._predict(self.problem.replace_inputs(records))
+        weights = self.problem.output_weights
+        return self._predict(self.problem.rebuild(records=records, weights=weights))
 
     def replace_input(
         self, name: str, change: Callable[[FloatArray], FloatArray], hold: Hold | None = None
@@ -618,6 +622,13 @@ def interpolate_known(channel: Channel, times: FloatArray) -> FloatArray:
             channel, times=channel.times[known], values=channel.values[known], repeats=None
         )
     return interpolate_channel(channel, times)
+
+
+def _differ_in_inputs_only(before: Record, after: Record) -> bool:
+    """Whether records have the same outputs, and inputs that begin at the same times."""
+    if any(one is not other for one, other in zip(before.outputs, after.outputs, strict=True)):
+        return False
+    return [one.times[0] for one in before.inputs] == [one.times[0] for one in after.inputs]
 
 
 class Refitted(NamedTuple):
