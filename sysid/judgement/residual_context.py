@@ -415,10 +415,11 @@ class ResidualContext:
 
         They are ``nan`` if no more simulations are allowed.
         """
-        problem = self.problem
-        if _have_same_times(problem.records, records):
-            return self._predict(problem.replace_inputs(records))
-        return self._predict(problem.rebuild(records=records, weights=problem.output_weights))
+        pairs = zip(self.problem.records, records, strict=True)
+        if all(_differ_in_inputs_only(before, after) for before, after in pairs):
+            return self._predict(self.problem.replace_inputs(records))
+        weights = self.problem.output_weights
+        return self._predict(self.problem.rebuild(records=records, weights=weights))
 
     def compute_effect(self, records: Sequence[Record]) -> FloatArray | None:
         """Compute what other inputs add to the simulated values (n,), as `simulate` has them.
@@ -618,17 +619,6 @@ class ResidualContext:
                 yield output.name, rows, format_unit(output.unit)
 
 
-def _have_same_times(before: Sequence[Record], after: Sequence[Record]) -> bool:
-    """Return whether records have the same outputs, and inputs at the same times."""
-    return all(
-        all(a is b for a, b in zip(new.outputs, old.outputs, strict=True))
-        and all(
-            np.array_equal(a.times, b.times) for a, b in zip(new.inputs, old.inputs, strict=True)
-        )
-        for old, new in zip(before, after, strict=True)
-    )
-
-
 def read_channel(channel: Channel, times: FloatArray, lag: float = 0.0) -> FloatArray:
     """Read a channel at times (n,) of samples, `lag` periods before; missing values are bridged.
 
@@ -648,6 +638,13 @@ def interpolate_known(channel: Channel, times: FloatArray) -> FloatArray:
             channel, times=channel.times[known], values=channel.values[known], repeats=None
         )
     return interpolate_channel(channel, times)
+
+
+def _differ_in_inputs_only(before: Record, after: Record) -> bool:
+    """Whether records have the same outputs, and inputs that begin at the same times."""
+    if any(one is not other for one, other in zip(before.outputs, after.outputs, strict=True)):
+        return False
+    return [one.times[0] for one in before.inputs] == [one.times[0] for one in after.inputs]
 
 
 class Refitted(NamedTuple):
