@@ -231,6 +231,30 @@ def test_a_load_acts_in_its_own_experiment_only() -> None:
     assert gain == pytest.approx(FAST.gain, rel=0.01)
 
 
+def test_two_experiments_in_one_record_have_the_same_parameters() -> None:
+    parts = [draw_levels(seed, N // 2) for seed in (1, 2)]
+    y = np.concatenate([FAST.respond(hold(u))[::FINE] for u in parts]) + NOISE * draw_noise(1)
+    (first, *_) = explain(FAST, make_record(np.concatenate(parts), y)).findings
+    assert first.explanation == "another experiment"
+    assert "begins at about 100" in first.brief
+    for move in first.moves:
+        assert move.value == pytest.approx(FAST.values[move.parameter], rel=0.02)
+
+
+def test_after_a_gap_another_experiment_begins() -> None:
+    """The input moved in the gap, so no sample after it says where the plant was."""
+    times = STEP * np.arange(N)
+    u = np.where((times > 100.0) & (times < 130.0), 2.0, draw_levels(1))
+    y = FAST.respond(hold(u))[::FINE] + NOISE * draw_noise(1)
+    kept = (times < 60.0) | (times > 130.0)
+    record = make_record(u[kept], y[kept], times=times[kept])
+    (first, *_) = explain(FAST, record).findings
+    assert first.explanation == "another experiment"
+    assert "at about 130.5 s, after a gap" in first.text
+    for move in first.moves:
+        assert move.value == pytest.approx(FAST.values[move.parameter], rel=0.02)
+
+
 def test_a_short_record_with_many_inputs_has_no_dynamics_in_its_noise() -> None:
     names, n = [f"u{i}" for i in range(5)], 52
     model = parse_model(
