@@ -238,7 +238,25 @@ def _score(
         [one.columns for one in candidates], [counted + one.counted for one in candidates], taken
     )
     pairs = zip(candidates, fits, strict=True)
-    return _order([_Scored(one, fit, criterion - fit.criterion) for one, fit in pairs])
+    return _order(
+        [
+            _Scored(one, fit, criterion - fit.criterion - _compute_loss(one, fit))
+            for one, fit in pairs
+        ]
+    )
+
+
+def _compute_loss(candidate: Candidate, fit: ColumnFit) -> float:
+    """Compute what a likelihood ratio loses if the coefficient is kept within its range.
+
+    The likelihood is that of a linear model with normal noise of unknown size.
+    """
+    if candidate.most is None:
+        return 0.0
+    value, error = float(fit.coefficients[-1]), max(float(fit.errors[-1]), 1e-300)
+    beyond = max(-value, value - candidate.most, 0.0) / error
+    samples = candidate.columns.shape[0]
+    return samples * float(np.log1p(beyond**2 / samples))
 
 
 def _order(scored: Sequence[_Scored]) -> list[_Scored]:

@@ -231,6 +231,17 @@ def test_a_load_acts_in_its_own_experiment_only() -> None:
     assert gain == pytest.approx(FAST.gain, rel=0.01)
 
 
+@pytest.mark.parametrize("seed", [1, 3])
+def test_what_goes_against_its_words_explains_nothing(seed: int) -> None:
+    """Of a noisy input of two levels, less than its dead zone is what acts: the levels."""
+    levels = np.where(draw_levels(seed) > 1.0, 2.0, 0.0)
+    y = FAST.respond(hold(levels))[::FINE] + NOISE * draw_noise(seed)
+    record = make_record(levels + 0.2 * draw_noise(seed + 1), y, reading="first")
+    (first, *_) = explain(FAST, record).findings
+    assert first.explanation == "noise of an input"
+    assert "dead zone" not in first.text
+
+
 def test_two_experiments_in_one_record_have_the_same_parameters() -> None:
     parts = [draw_levels(seed, N // 2) for seed in (1, 2)]
     y = np.concatenate([FAST.respond(hold(u))[::FINE] for u in parts]) + NOISE * draw_noise(1)
