@@ -256,7 +256,7 @@ def _compute_loss(candidate: Candidate, fit: ColumnFit) -> float:
     value, error = float(fit.coefficients[-1]), max(float(fit.errors[-1]), 1e-300)
     beyond = max(-value, value - candidate.most, 0.0) / error
     samples = candidate.columns.shape[0]
-    return samples * float(np.log1p(beyond**2 / samples))
+    return float(samples * np.log1p(beyond**2 / samples))
 
 
 def _order(scored: Sequence[_Scored]) -> list[_Scored]:
