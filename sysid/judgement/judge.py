@@ -256,7 +256,7 @@ def _compute_loss(candidate: Candidate, fit: ColumnFit) -> float:
     value, error = float(fit.coefficients[-1]), max(float(fit.errors[-1]), 1e-300)
     beyond = max(-value, value - candidate.most, 0.0) / error
     samples = candidate.columns.shape[0]
-    return float(samples * np.log1p(beyond**2 / samples))
+    return float(2.0 * samples * np.log(np.hypot(1.0, beyond / np.sqrt(samples))))
 
 
 def _order(scored: Sequence[_Scored]) -> list[_Scored]:
