@@ -238,7 +238,25 @@ def _score(
         [one.columns for one in candidates], [counted + one.counted for one in candidates], taken
     )
     pairs = zip(candidates, fits, strict=True)
-    return _order([_Scored(one, fit, criterion - fit.criterion) for one, fit in pairs])
+    return _order(
+        [
+            _Scored(one, fit, criterion - fit.criterion - _compute_loss(one, fit))
+            for one, fit in pairs
+        ]
+    )
+
+
+def _compute_loss(candidate: Candidate, fit: ColumnFit) -> float:
+    """Compute what a likelihood ratio loses if the coefficient is kept within its range.
+
+    The likelihood is that of a linear model with normal noise of unknown size.
+    """
+    if candidate.most is None:
+        return 0.0
+    value, error = float(fit.coefficients[-1]), max(float(fit.errors[-1]), 1e-300)
+    beyond = max(-value, value - candidate.most, 0.0) / error
+    samples = candidate.columns.shape[0]
+    return float(2.0 * samples * np.log(np.hypot(1.0, beyond / np.sqrt(samples))))
 
 
 def _order(scored: Sequence[_Scored]) -> list[_Scored]:
@@ -272,17 +290,50 @@ def _refit_finalists(
             refitted[position] = one._replace(gain=gain, moves=found.moves)
         elif gain > one.gain - STRONG_ODDS:
             refitted[position] = one._replace(gain=max(gain, one.gain), moves=found.moves)
-    parted = _part_finalist(context, scored, criterion)
-    return _order([*refitted, *parted])
+    return _order([*refitted, *_refit_moments(context, scored, criterion)])
 
 
-def _part_finalist(
+def _refit_moments(
     context: ResidualContext, scored: Sequence[_Scored], criterion: float
 ) -> list[_Scored]:
-    """Fit both sides of the likeliest moment of a change by themselves."""
-    likeliest = next((one for one in scored if one.candidate.moment is not None), None)
-    if likeliest is None or likeliest.gain <= 0.0:
+    """Fit in full what begins at the likeliest moment of a change, and after a gap."""
+    if not scored or scored[0].gain <= 0.0:
         return []
+    refitted, moments = list[_Scored](), list(context.gap_ends)
+    likeliest = next((one for one in scored if one.candidate.moment is not None), None)
+    if likeliest is not None and likeliest.gain > 0.0:
+        moments.append(likeliest.candidate.moment or 0.0)
+        refitted += _part_finalist(context, likeliest, criterion)
+    for moment in dict.fromkeys(moments):
+        refitted += _divide_finalist(context, scored[0], moment, criterion)
+    return refitted
+
+
+def _divide_finalist(
+    context: ResidualContext, likeliest: _Scored, moment: float, criterion: float
+) -> list[_Scored]:
+    """Let another experiment begin at a moment (s), which counts as a parameter."""
+    found = context.refit_experiments(moment)
+    if found is None:
+        return []
+    gain = float(criterion - found.criterion - np.log(max(context.times.size, 2)))
+    gap = ", after a gap of the stamps," if moment in context.gap_ends else ""
+    candidate = Candidate(
+        "another experiment",
+        "record",
+        likeliest.candidate.columns,
+        f"another experiment begins at about {moment:.4g} s",
+        f"at about {moment:.4g} s{gap} another experiment begins: the parameters stay, and the "
+        "states and the earlier input are others",
+        "Label the rows of each experiment in a column of their own, and divide the recording by "
+        "it (segments).",
+        moment=moment,
+    )
+    return [_Scored(candidate, likeliest.fit, gain, found.moves)]
+
+
+def _part_finalist(context: ResidualContext, likeliest: _Scored, criterion: float) -> list[_Scored]:
+    """Fit both sides of the likeliest moment of a change by themselves."""
     moment = likeliest.candidate.moment or 0.0
     found = context.refit_parts(moment)
     if found is None:

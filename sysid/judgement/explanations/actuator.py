@@ -16,7 +16,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
-from sysid.judgement.residual_context import Candidate, ResidualContext
+from sysid.judgement.residual_context import (
+    AS_TOLD,
+    TO_THE_NEXT,
+    Candidate,
+    ResidualContext,
+)
 from sysid.judgement.unrecorded_input import compute_reach
 from sysid.results.findings import Family
 
@@ -34,6 +39,7 @@ class _Change(NamedTuple):
     family: Family
     brief: str
     text: str
+    most: float | None = TO_THE_NEXT
 
 
 def propose(context: ResidualContext) -> Iterator[Candidate]:
@@ -58,6 +64,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                     counted=1,
                     change={"records": records},
                     is_vague=change.family == "input",
+                    most=change.most,
                 )
         direct = context.read_input(name)
         yield Candidate(
@@ -137,6 +144,7 @@ def _list_changes(name: str, low: float, high: float, span: float) -> Iterator[_
             "actuator",
             f"{name} acts along a curve",
             f"the plant follows {name} along a curve, about {word} of it: a nonlinear actuator",
+            None,
         )
     for share in _PLAYS:
         yield _Change(
@@ -171,6 +179,7 @@ def _list_smoothings(name: str) -> Iterator[_Change]:
         f"{name} was recorded with noise",
         f"the levels between which {name} steps explain the output better than {name} itself: its "
         "record has noise that does not act on the plant",
+        AS_TOLD,
     )
     for width, smooth in product(_WIDTHS, (_smooth, _take_medians, _keep_edges)):
         yield _Change(
@@ -180,6 +189,7 @@ def _list_smoothings(name: str) -> Iterator[_Change]:
             f"{name} was recorded with noise",
             f"a mean of {name} over {width} samples explains the output better than {name} itself. "
             "Its record has noise or steps of a converter that do not act on the plant",
+            AS_TOLD,
         )
 
 

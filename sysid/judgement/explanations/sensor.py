@@ -11,7 +11,13 @@ import numpy as np
 
 from sysid.core.types import BoolArray, FloatArray
 from sysid.core.units import format_unit
-from sysid.judgement.residual_context import CUT_THERE, Candidate, ResidualContext
+from sysid.judgement.residual_context import (
+    AS_TOLD,
+    CUT_THERE,
+    TO_THE_NEXT,
+    Candidate,
+    ResidualContext,
+)
 
 _LIMIT_SAMPLES, _LIMIT_SHARE = 5, 0.02  # equal readings at an end of the range
 _HINGES = (0.0, 0.1, 0.2, 0.3)  # of the range, from its end
@@ -136,6 +142,7 @@ def _propose_lines(context: ResidualContext, name: str, rows: BoolArray) -> Iter
             "and are no measurements",
             f"Keep the measured rows of {name}, and leave the others empty.",
             is_vague=True,
+            most=AS_TOLD,
         )
 
 
@@ -159,6 +166,7 @@ def _propose_old_readings(
             f"{name} repeats old readings",
             f"{name} repeats its last reading until the sensor has a new one, or is stuck",
             f"Keep the first row of equal readings of {name}, and leave the others empty.",
+            most=AS_TOLD,
         )
     for samples in _MEANS:
         before = np.zeros(rows.size)
@@ -176,6 +184,7 @@ def _propose_old_readings(
                 "",
                 counted=1,
                 doubtful=context.delays,
+                most=TO_THE_NEXT,
             )
 
 

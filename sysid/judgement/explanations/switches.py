@@ -18,7 +18,7 @@ import numpy as np
 from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import Channel, Record
-from sysid.judgement.residual_context import Candidate, ResidualContext
+from sysid.judgement.residual_context import Candidate, ResidualContext, find_gaps
 
 _MOST_SHARE = 0.3  # changes for a sample: more of them explain anything
 _FEWEST = 3  # changes, of which a common part is a time lag
@@ -135,9 +135,10 @@ def _switch_early(records: tuple[Record, ...], name: str, early: FloatArray) -> 
 
 
 def _find_changes(record: Record, name: str) -> IntArray:
-    """Find the samples of an input that differ from those before."""
-    found = _find_channel(record, name)
-    return np.flatnonzero(np.diff(found[0].values)) + 1 if found else np.zeros(0, dtype=np.int64)
+    """Find the samples of an input that differ from those before, but for those after a gap."""
+    for one in _find_channel(record, name):
+        return np.flatnonzero((np.diff(one.values) != 0) & ~find_gaps(one.times)) + 1
+    return np.zeros(0, dtype=np.int64)
 
 
 def _find_channel(record: Record, name: str) -> list[Channel]:

@@ -231,6 +231,41 @@ def test_a_load_acts_in_its_own_experiment_only() -> None:
     assert gain == pytest.approx(FAST.gain, rel=0.01)
 
 
+@pytest.mark.parametrize("seed", [1, 3])
+def test_what_goes_against_its_words_explains_nothing(seed: int) -> None:
+    """Of a noisy input of two levels, less than its dead zone is what acts: the levels."""
+    levels = np.where(draw_levels(seed) > 1.0, 2.0, 0.0)
+    y = FAST.respond(hold(levels))[::FINE] + NOISE * draw_noise(seed)
+    record = make_record(levels + 0.2 * draw_noise(seed + 1), y, reading="first")
+    (first, *_) = explain(FAST, record).findings
+    assert first.explanation == "noise of an input"
+    assert "dead zone" not in first.text
+
+
+def test_two_experiments_in_one_record_have_the_same_parameters() -> None:
+    parts = [draw_levels(seed, N // 2) for seed in (1, 2)]
+    y = np.concatenate([FAST.respond(hold(u))[::FINE] for u in parts]) + NOISE * draw_noise(1)
+    (first, *_) = explain(FAST, make_record(np.concatenate(parts), y)).findings
+    assert first.explanation == "another experiment"
+    assert "begins at about 100" in first.brief
+    for move in first.moves:
+        assert move.value == pytest.approx(FAST.values[move.parameter], rel=0.02)
+
+
+def test_after_a_gap_another_experiment_begins() -> None:
+    """The input moved in the gap, so no sample after it says where the plant was."""
+    times = STEP * np.arange(N)
+    u = np.where((times > 100.0) & (times < 130.0), 2.0, draw_levels(1))
+    y = FAST.respond(hold(u))[::FINE] + NOISE * draw_noise(1)
+    kept = (times < 60.0) | (times > 130.0)
+    record = make_record(u[kept], y[kept], times=times[kept])
+    (first, *_) = explain(FAST, record).findings
+    assert first.explanation == "another experiment"
+    assert "at about 130.5 s, after a gap" in first.text
+    for move in first.moves:
+        assert move.value == pytest.approx(FAST.values[move.parameter], rel=0.02)
+
+
 def test_a_short_record_with_many_inputs_has_no_dynamics_in_its_noise() -> None:
     names, n = [f"u{i}" for i in range(5)], 52
     model = parse_model(

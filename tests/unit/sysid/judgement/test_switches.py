@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sysid.judgement.explanations import switches
 from sysid.judgement.judge import explain_residuals
 from tests.support.library.defects import READING
 from tests.support.library.judged_records import (
@@ -13,6 +14,7 @@ from tests.support.library.judged_records import (
     build_context,
     draw_levels,
     draw_record,
+    make_record,
 )
 
 (CASE,) = (one for one in READING if one.explanations == ("switches between samples",))
@@ -36,3 +38,17 @@ def test_a_sound_record_has_no_early_switches() -> None:
     for seed in range(3):
         record = draw_record(FAST, seed, pole=0.9)
         assert explain_residuals(build_context([record], "fopdt", FAST.values)).findings == ()
+
+
+def test_what_moves_in_a_gap_of_the_stamps_is_no_early_switch() -> None:
+    first, second = (CASE.draw(FAST, seed) for seed in (1, 2))
+    (u,), (y,) = second.inputs, second.outputs
+    jumps = np.flatnonzero(np.diff(u.values)) + 1
+    last = int(jumps[jumps.size // 2])
+    late = np.where(np.arange(u.times.size) >= last, 500.0, 0.0)
+    gapped = make_record(u.values, y.values, times=u.times + late)
+    (found,) = switches.propose(build_context([first, gapped], "fopdt", FAST.values))
+    (moved,) = found.change["records"][1].inputs
+    is_earlier = moved.times < gapped.inputs[0].times
+    assert is_earlier[jumps[jumps != last]].sum() > 0.9 * (jumps.size - 1)
+    assert not is_earlier[last]
