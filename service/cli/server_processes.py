@@ -28,7 +28,10 @@ if TYPE_CHECKING:
     from service.storage.sessions import Database
 
 
+_log = logging.getLogger("lagid.web")
+
 SHUTDOWN_SECONDS = 3  # time for open answers once the process is asked to end
+END_SECONDS = 9.0  # then the process ends, whatever its threads wait for
 
 Host = Annotated[str | None, typer.Option(help="Address to listen on.")]
 Port = Annotated[int | None, typer.Option(min=0, max=65535, help="Port; 0 chooses a free one.")]
@@ -169,6 +172,7 @@ def _run_server(
         """Server that stops open event streams and the dispatcher as soon as it must end."""
 
         def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+            _end_in_time(sig)
             if supervisor is not None:
                 threading.Thread(target=supervisor.stop, name="end").start()
             parts = getattr(app.state, "parts", None)
@@ -251,11 +255,25 @@ def _check_access(settings: "Settings") -> None:
 def _exit_on_signals() -> None:
     """End by an exception, so that resources are closed; uvicorn raises the signal again."""
 
-    def end(_signal: int, _frame: FrameType | None) -> None:
+    def end(number: int, _frame: FrameType | None) -> None:
+        _end_in_time(number)
         raise SystemExit(0)
 
     signal.signal(signal.SIGTERM, end)
     signal.signal(signal.SIGINT, end)
+
+
+def _end_in_time(number: int) -> None:
+    """End the process `END_SECONDS` after a signal, even if a thread waits for ever."""
+
+    def end() -> None:
+        standing = ", ".join(sorted(thread.name for thread in threading.enumerate()))
+        _log.error("the process is ended %g s after signal %d: %s", END_SECONDS, number, standing)
+        os._exit(128 + number)  # the code of a process that a signal has ended
+
+    timer = threading.Timer(END_SECONDS, end)
+    timer.daemon = True
+    timer.start()
 
 
 database_app = typer.Typer(help="Upgrade and check the database.", no_args_is_help=True)

@@ -3,6 +3,7 @@
 It is a process of its own (`service.dispatch.process`). Any number of dispatchers share one queue.
 """
 
+import faulthandler
 import gc
 import logging
 import os
@@ -20,6 +21,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.core.errors import Misconfigured
 from service.core.process import service_metrics
 from service.core.process.logs import bind_ids
+from service.core.process.loop_watch import LoopWatch
 from service.core.settings import Settings
 from service.dispatch.background import BackgroundJobs, DocumentMaker
 from service.dispatch.held_jobs import HeldJob, choose_first_size
@@ -56,6 +58,8 @@ BUSY_SECONDS = 0.2
 STEP_SECONDS = 0.1
 RELEASE_SECONDS = 5.0
 """Time limit for releasing the jobs once the parent or the workers are gone."""
+STANDS_SECONDS = 60.0
+"""A main loop that stands for this time does not return. Each wait has a limit that is shorter."""
 MAX_JOBS = 64
 """Jobs held at a time. They share the workers, and their runs are read when needed. As many again
 may be claimed if they are short or urgent: one identification need not wait for 64 sweeps."""
@@ -119,10 +123,13 @@ class Dispatcher:
         try:
             with _spare_from_collection():
                 while not self.stopping.is_set():
+                    self._leases.loop.turn()
                     self.run_round()
         except ClusterLost:
             self._release_jobs(lost=True)
             raise
+        finally:
+            self._leases.loop.end()
         self._scheduler.stop_jobs()
         self._release_jobs()
 
@@ -431,6 +438,7 @@ def serve_jobs(settings: Settings, local: LocalRay | None, start: DispatcherStar
             cluster=None if executor.identity is None else executor,
         )
         _stop_on_signals(dispatcher.stopping, executor)
+        _watch_process(dispatcher.stopping, executor, start.leases.loop)
         dispatcher.run_until_stopped()
     except ClusterLost as error:
         _log.error("%s", error)
@@ -476,7 +484,6 @@ def _stop_on_signals(stopping: threading.Event, executor: RayExecutor) -> None:
     signal.signal(signal.SIGINT, handle)
     if os.environ.get(SUPERVISED_VARIABLE):
         threading.Thread(target=_exit_with_parent, args=(stopping, executor), daemon=True).start()
-    threading.Thread(target=_exit_with_cluster, args=(stopping, executor), daemon=True).start()
 
 
 def _exit_with_parent(stopping: threading.Event, executor: RayExecutor) -> None:
@@ -488,12 +495,27 @@ def _exit_with_parent(stopping: threading.Event, executor: RayExecutor) -> None:
     _exit_now(executor)
 
 
-def _exit_with_cluster(stopping: threading.Event, executor: RayExecutor) -> None:
-    """Exit when the cluster is lost, even if the main thread hangs in a call to Ray."""
-    while not stopping.wait(IDLE_SECONDS):
-        if not executor.is_alive():
-            time.sleep(RELEASE_SECONDS)
-            _exit_now(executor)
+def _watch_process(stopping: threading.Event, executor: RayExecutor, loop: LoopWatch) -> None:
+    """End the process if the cluster is lost or the main loop stands: the supervisor restarts it.
+
+    It may hang in a call to Ray, or in native code that keeps even this thread from running. A
+    timer of the C library ends it then.
+    """
+    service_metrics.loop_standing.set_function(lambda: loop.standing_seconds)
+
+    def watch() -> None:
+        while not stopping.wait(IDLE_SECONDS):
+            faulthandler.dump_traceback_later(2 * STANDS_SECONDS, exit=True)
+            if not executor.is_alive():
+                time.sleep(RELEASE_SECONDS)
+                _exit_now(executor)
+            if loop.standing_seconds > STANDS_SECONDS:
+                _log.error("the main loop stands for %g s. What it does follows", STANDS_SECONDS)
+                faulthandler.dump_traceback()
+                _exit_now(executor)
+        faulthandler.cancel_dump_traceback_later()
+
+    threading.Thread(target=watch, name="watch", daemon=True).start()
 
 
 def _exit_now(executor: RayExecutor) -> None:

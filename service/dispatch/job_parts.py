@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from service.core.bodies.json_pointer import build_run_body
 from service.core.errors import ServiceError
+from service.core.process.loop_watch import allow_long_step
 from service.datasets.signal_channels import SignalChannels, map_channels
 from service.datasets.stored_recordings import read_records
 from service.dispatch.encoding import ResultEncoder
@@ -33,6 +34,8 @@ from workers.protocol import ProblemSpec, Records, RunSpec, WarmStartValues
 
 CACHED_SAMPLES = 1_000_000
 """Samples that a job caches, 16 bytes each, in addition to the latest records."""
+LOAD_SECONDS = 120.0
+"""Time in which recordings are read from the object store, after which the dispatcher stands."""
 
 
 class DataKey(NamedTuple):
@@ -161,7 +164,8 @@ class JobParts:
         datasets, channels = self._data[key]
         try:
             rows = retry_transient(partial(self._read_datasets, datasets))
-            return read_records(self._store, rows, channels)
+            with allow_long_step(LOAD_SECONDS):
+                return read_records(self._store, rows, channels)
         except (SysidError, ServiceError, StorageError) as error:
             raise RecordsUnavailable(str(error)) from error
 

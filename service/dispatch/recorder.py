@@ -12,6 +12,7 @@ from itertools import accumulate
 from sqlalchemy.orm import Session
 
 from service.core.process import service_metrics
+from service.core.process.loop_watch import allow_long_step
 from service.core.states import JobState
 from service.dispatch.checkpoints import pack_state
 from service.dispatch.fitted_signals import store_signals
@@ -29,7 +30,7 @@ from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.history_rows import HistoryPoint, MigrantPoint
 from service.storage.columns import Document
 from service.storage.objects import ObjectStore
-from service.storage.retry import retry_transient
+from service.storage.retry import GIVE_UP_SECONDS, retry_transient
 from service.storage.sessions import Database
 from service.storage.storage_errors import ObjectStoreFailed
 from sysid.islands.run_state import RunState
@@ -440,7 +441,8 @@ class RunRecorder:
         batch, written = self._written_beside
         self._written_beside = None
         try:
-            written.result()
+            with allow_long_step(GIVE_UP_SECONDS):
+                written.result()
         except BaseException:
             batch.pending.append(self._pending)
             self._pending = batch.pending

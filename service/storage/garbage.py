@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 
 from service.storage.columns import utc_now
 from service.storage.objects import RENEWAL_AGE, ObjectStore, StoredObject
-from service.storage.sessions import Database
+from service.storage.sessions import Database, release_connection
 from service.storage.statements import split_chunks
 from service.storage.tables import Dataset, Job, Run
 
@@ -35,6 +35,7 @@ def find_orphans(
     )
     for items in split_chunks(old):
         named = _find_named_hashes(session, [item.sha256 for item in items], limit)
+        release_connection(session)  # the store may take its time
         yield from (item for item in items if item.sha256 not in named)
 
 
@@ -46,6 +47,7 @@ def find_lost_hashes(session: Session, store: ObjectStore) -> Iterator[str]:
             column = query.selected_columns[0]
             part = query.where(column >= prefix, column < f"{prefix}g").distinct()
             named.update(session.scalars(part))
+        release_connection(session)  # the store may take its time
         # Listed after the rows were read: an object is written before its row.
         named.difference_update(item.sha256 for item in store.list_objects(prefix))
         yield from sorted(filter(None, named))

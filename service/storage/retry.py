@@ -8,6 +8,8 @@ from typing import TypeVar
 
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 
+from service.core.process.loop_watch import report_turn
+
 _log = logging.getLogger(__name__)
 
 T = TypeVar("T")
@@ -72,6 +74,7 @@ def retry_transient(work: Callable[[], T]) -> T:
             if not is_logged:
                 _log.warning("the database does not answer: %s", str(error).splitlines()[0])
             is_logged = True
+            report_turn()
             time.sleep(PAUSE_SECONDS)
         else:
             if is_logged:

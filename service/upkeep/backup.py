@@ -30,7 +30,7 @@ from service.storage import migrate
 from service.storage.columns import DocumentType, OrderedJsonType, UtcDateTime, utc_now
 from service.storage.garbage import select_hashes
 from service.storage.objects import ObjectStore
-from service.storage.sessions import Database
+from service.storage.sessions import BUSY_SECONDS, Database
 from service.storage.statements import split_chunks
 from service.storage.storage_errors import ObjectMissing, StorageError
 from service.storage.tables import Base, DispatcherHeartbeat, WebSession
@@ -324,7 +324,7 @@ def _restore_rows(
         current = None
     if current is None:
         migrate.upgrade_database(database, revision)
-    with database.engine.begin() as connection:
+    with database.get_waiting_engine(BUSY_SECONDS).begin() as connection:
         existing = set(sa.inspect(connection).get_table_names())
         for table in reversed(Base.metadata.sorted_tables):
             if table.name in existing:

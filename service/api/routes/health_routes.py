@@ -13,7 +13,7 @@ from service.api.queue_metrics import write_metrics
 from service.api.requests.dependencies import Parts, PartsDep
 from service.core.bodies.wire import Answer
 from service.core.errors import FieldError, Unavailable
-from service.queue.dispatchers import DispatcherRepository, describe_wait
+from service.queue.dispatchers import DispatcherRepository
 from service.storage import migrate
 from service.storage.storage_errors import DatabaseNotAtHead
 
@@ -103,7 +103,7 @@ def collect_failures(parts: Parts) -> Iterator[FieldError]:
     try:
         migrate.check_revision(parts.database)
         with parts.database.read_session() as session:
-            wait = describe_wait(DispatcherRepository(session).list_alive())
+            wait = DispatcherRepository(session).describe_wait()
     except SQLAlchemyError:
         yield FieldError("/database", "database: unreachable")
     except DatabaseNotAtHead as error:
