@@ -8,6 +8,7 @@ from typing import Any
 
 from workers.active_run import MAX_KILLS, ActiveRun
 from workers.errors import RecordsUnavailable
+from workers.pack_watch import compute_time_limit
 from workers.packing import PACKS_PER_CPU, MeanCost, balance_packs, choose_pack_size
 from workers.protocol import (
     EvolveIsland,
@@ -43,6 +44,10 @@ class SharedWork:
 
     Attributes
     ----------
+    cost : MeanCost
+        That of a run; it has none before the first has ended.
+    longest_seconds : float
+        Time of the longest item.
     records : dict
         Records that the executor has, by key.
     queues : list of JobQueue
@@ -50,6 +55,7 @@ class SharedWork:
     """
 
     cost: MeanCost = field(default_factory=MeanCost)
+    longest_seconds: float = 0.0
     records: dict[str, Any] = field(default_factory=dict)
     queues: "list[JobQueue]" = field(default_factory=list)
 
@@ -163,6 +169,7 @@ class JobQueue:
             if run is None:
                 continue  # it failed while another of its islands was in flight
             run.seconds += result.seconds
+            self._shared.longest_seconds = max(self._shared.longest_seconds, result.seconds)
             if run not in waiting:
                 continue
             if result.outcome is not None:
@@ -195,6 +202,15 @@ class JobQueue:
         """Fail the runs of a pack after a programming error."""
         for run in self._release_runs(handle, self.in_flight.pop(handle)):
             self._fail_run(run.run, RunFailure(reason, "InternalError"))
+
+    def compute_time_limit(self, handle: PackHandle) -> float:
+        """Compute the time after which a pack in flight is not waited for, in s."""
+        items = self.in_flight[handle]
+        runs = [self._active[item.run] for item in items if item.run in self._active]
+        is_known = self._shared.cost.seconds is not None
+        is_again = any(run.kills or run.is_suspect for run in runs)
+        longest = self._shared.longest_seconds if is_known and not is_again else None
+        return compute_time_limit(len(items), longest)
 
     def stop_sending(self) -> None:
         """Send nothing more."""

@@ -322,6 +322,9 @@ class RunObserver(Protocol):
     def record_worker_death(self, run: str, kills: int) -> None:
         """The worker died on this run alone, `kills` times so far; 0: it made progress since."""
 
+    def record_silent_worker(self, text: str) -> None:
+        """A worker did not answer and is replaced, as the text tells."""
+
     def record_progress(self, run: str, state: RunState, seconds: float) -> None:
         """The run can continue from `state` after `seconds` of compute time."""
 

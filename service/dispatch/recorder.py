@@ -102,8 +102,9 @@ class _PendingWrites:
 
     @property
     def has_runs(self) -> bool:
-        """Whether a run has begun, ended or lost its worker."""
-        return bool(self.outcomes or self.packs or self.started or self.reused or self.kills)
+        """Whether a run has begun, ended or lost its worker, or there is something to tell."""
+        ended = self.outcomes or self.packs or self.reused
+        return bool(ended or self.started or self.kills or self.messages)
 
     def count_ended(self) -> int:
         """Count the runs that have ended."""
@@ -227,6 +228,11 @@ class RunRecorder:
     def record_worker_death(self, run: str, kills: int) -> None:
         """Record that the run alone killed its worker, `kills` times since its last progress."""
         self._pending.kills[run] = kills  # written at once: the dispatcher may die too
+
+    def record_silent_worker(self, text: str) -> None:
+        """Record that a worker did not answer and is replaced, as the text tells."""
+        service_metrics.silent_workers.inc()
+        self._pending.messages.append(text)
 
     def record_progress(self, run: str, state: RunState, seconds: float) -> None:
         """Record a state from which the run can continue."""
