@@ -4,6 +4,7 @@
     - ClusterUnavailable   Ray could not be started or joined
     - ClusterLost          Ray does not answer any more: the process should end and be restarted
     - RecordsUnavailable   a run's records cannot be loaded
+    - RecordsDelayed       a run's records cannot be loaded now, and perhaps later
     - InvalidCheckpoint    a run's checkpoint does not fit its model or its settings
     - PackLost             a pack of work was not finished
         - WorkerDied           its process was killed or ran out of memory
@@ -28,6 +29,10 @@ class ClusterLost(WorkersError):
 
 class RecordsUnavailable(WorkersError):
     """A run's records cannot be loaded; the message is a sentence for its user."""
+
+
+class RecordsDelayed(WorkersError):
+    """A run's records cannot be loaded now, because their store is away; the message says why."""
 
 
 class InvalidCheckpoint(WorkersError):

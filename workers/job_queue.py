@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from workers.active_run import MAX_KILLS, ActiveRun
-from workers.errors import RecordsUnavailable
+from workers.errors import RecordsDelayed, RecordsUnavailable
 from workers.pack_watch import compute_time_limit
 from workers.packing import PACKS_PER_CPU, MeanCost, balance_packs, choose_pack_size
 from workers.protocol import (
@@ -33,6 +33,9 @@ from workers.protocol import (
 MAX_SHARED_RECORDS = 16
 """Largest number of record sets that a job shares with the executor."""
 
+
+DELAY_SECONDS = 5.0
+"""Pause before records are asked for again whose store is away."""
 
 READ_SECONDS_PER_CORE = 4.0
 """Runs that take longer than this together are not read ahead for a core."""
@@ -95,7 +98,8 @@ class JobQueue:
         self._active: dict[str, ActiveRun] = {}
         self._shared = shared or SharedWork()
         self._shared.queues.append(self)
-        self._exhausted = False
+        self._exhausted = self._is_delayed = False
+        self._asked_at = 0.0
         self.has_no_more = False
 
     def leave(self) -> None:
@@ -116,8 +120,15 @@ class JobQueue:
         """Read runs until `wanted` of them wait or the time is up; return whether a run waits.
 
         A pack of them is read in any case, because small packs would take even more time. Long
-        runs are not read far ahead: another dispatcher may take them.
+        runs are not read far ahead: another dispatcher may take them. While the store of the
+        records is away, no run waits for a worker.
         """
+        if not self._is_delayed or time.monotonic() - self._asked_at >= DELAY_SECONDS:
+            self._read_runs(wanted, deadline)
+            return bool(self._ready)
+        return False
+
+    def _read_runs(self, wanted: int, deadline: float) -> None:
         cost, cores = self._shared.cost.seconds, self._executor.slots
         if cost is not None:
             far = int(READ_SECONDS_PER_CORE * cores / max(cost, 1e-4))
@@ -141,7 +152,6 @@ class JobQueue:
             left -= 1
             if left <= 0 and time.monotonic() > deadline:
                 break
-        return bool(self._ready)
 
     def send_next_pack(self, idle: int) -> None:
         """Send the next pack, or one run's islands as several packs if `idle` cores allow."""
@@ -238,6 +248,9 @@ class JobQueue:
         keys = items[0].spec.problem.record_keys
         try:
             shared = {key: self._share_records(key) for key in keys}
+        except RecordsDelayed as error:
+            self._delay_items(items, str(error))
+            return
         except RecordsUnavailable as error:
             for name in {item.run for item in items}:
                 self._fail_run(name, RunFailure(str(error), type(error).__name__))
@@ -248,6 +261,15 @@ class JobQueue:
         self.in_flight[handle] = tuple(items)
         for item in items:
             self._active[item.run].pack_handles.add(handle)
+
+    def _delay_items(self, items: Sequence[WorkItem], reason: str) -> None:
+        """Put the runs of these items back, until their records can be loaded."""
+        if not self._is_delayed:
+            self.observer.record_delay(reason)
+        self._is_delayed, self._asked_at = True, time.monotonic()
+        for name in reversed(dict.fromkeys(item.run for item in items)):
+            self._active[name].restart_epoch()
+            self._ready.appendleft(self._active[name])
 
     def _release_runs(self, handle: PackHandle, items: Sequence[WorkItem]) -> list[ActiveRun]:
         """Release the runs that wait for this pack; others continued without it."""
@@ -269,6 +291,7 @@ class JobQueue:
             while len(shared) >= MAX_SHARED_RECORDS:
                 shared.pop(next(iter(shared)))
             shared[key] = self._executor.share_records(self._source.load_records(key))
+            self._is_delayed = False
         return shared[key]
 
     def _take_result(self, run: ActiveRun, result: ItemResult) -> None:

@@ -22,14 +22,14 @@ from service.repositories.dataset_rows import DatasetRepository
 from service.storage.objects import ObjectStore
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
-from service.storage.storage_errors import StorageError
+from service.storage.storage_errors import ObjectStoreFailed, StorageError
 from service.storage.tables import Dataset, Job
 from sysid.core.errors import SysidError
 from sysid.core.settings import GeneticAlgorithm
 from sysid.data.noise import Noise
 from sysid.identification.options import RunOptions
 from sysid.models.model import Model
-from workers.errors import RecordsUnavailable
+from workers.errors import RecordsDelayed, RecordsUnavailable
 from workers.protocol import ProblemSpec, Records, RunSpec, WarmStartValues
 
 CACHED_SAMPLES = 1_000_000
@@ -143,6 +143,8 @@ class JobParts:
         ------
         RecordsUnavailable
             If a dataset or a channel is missing or invalid.
+        RecordsDelayed
+            If the object store does not answer, as long as that lasts.
         """
         if key not in self._cached_records:
             self._cached_records[key] = self._read_records(key)
@@ -166,6 +168,8 @@ class JobParts:
             rows = retry_transient(partial(self._read_datasets, datasets))
             with allow_long_step(LOAD_SECONDS):
                 return read_records(self._store, rows, channels)
+        except ObjectStoreFailed as error:
+            raise RecordsDelayed(str(error)) from error
         except (SysidError, ServiceError, StorageError) as error:
             raise RecordsUnavailable(str(error)) from error
 

@@ -164,7 +164,7 @@ class JobRuns:
             yield run if source is None else ReusedRun(run.run, source)
 
     def load_records(self, key: str) -> Records:
-        """Load the records of that key, or raise `RecordsUnavailable`."""
+        """Load the records of that key; else `RecordsUnavailable`, or `RecordsDelayed`."""
         return self.parts.load_records(key)
 
     def _read_checkpoints(self) -> dict[str, bytes]:

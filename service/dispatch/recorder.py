@@ -12,6 +12,7 @@ from itertools import accumulate
 from sqlalchemy.orm import Session
 
 from service.core.process import service_metrics
+from service.core.process.logs import bind_ids
 from service.core.process.loop_watch import allow_long_step
 from service.core.states import JobState
 from service.dispatch.checkpoints import pack_state
@@ -233,6 +234,12 @@ class RunRecorder:
         """Record that a worker did not answer and is replaced, as the text tells."""
         service_metrics.silent_workers.inc()
         self._pending.messages.append(text)
+
+    def record_delay(self, reason: str) -> None:
+        """Record that runs wait, because their records cannot be loaded now."""
+        with bind_ids(job_id=self.lease.job_id, attempt=self.lease.attempt):
+            _log.warning("runs wait for their recordings: %s", reason)
+        self._pending.messages.append(f"its runs wait for their recordings: {reason}")
 
     def record_progress(self, run: str, state: RunState, seconds: float) -> None:
         """Record a state from which the run can continue."""

@@ -7,13 +7,17 @@ import numpy as np
 import pytest
 
 from service.core.states import OPEN_STATES, JobState
-from service.dispatch import run_cramer_rao
+from service.datasets import stored_recordings
+from service.dispatch import job_parts, run_cramer_rao
 from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.held_leases import HeldLeases
+from service.repositories.event_rows import EventRepository
+from service.storage.storage_errors import ObjectStoreFailed
 from service.sweeps.group_cramer_rao import StoredBounds
 from sysid.uncertainty.cramer_rao import cramer_rao_bound
 from tests.support.cluster.inline_executor import InlineExecutor
 from tests.support.limits import LIMIT_SECONDS
+from workers import job_queue
 
 pytestmark = pytest.mark.slow
 
@@ -115,3 +119,25 @@ def test_of_more_problems_than_bounds_are_computed_of_a_note_tells(place, monkey
 
 
 SKIPS = [{"path": "/skip", "values": [1, 2]}, {"path": "/skip", "values": [1, 2, 3]}]
+
+
+def test_bounds_and_runs_wait_for_a_store_that_is_away(place, monkeypatch):
+    monkeypatch.setattr(job_queue, "DELAY_SECONDS", 0.0)
+    monkeypatch.setattr(run_cramer_rao, "RETRY_SECONDS", 0.0)
+    read, n_refused = place.store.get_bytes, [0]
+
+    def refuse(sha256):
+        n_refused[0] += 1
+        if n_refused[0] % 4:
+            raise ObjectStoreFailed("the object store cannot read an object: 500")
+        return read(sha256)
+
+    monkeypatch.setattr(place.store, "get_bytes", refuse)
+    monkeypatch.setattr(stored_recordings, "CACHE_SIZE", 0)
+    monkeypatch.setattr(job_parts, "CACHED_SAMPLES", 0)
+    (job,) = carry_out_jobs(place, place.submit(**NOISY))
+    assert job.state is JobState.SUCCEEDED
+    assert job.cramer_rao["problems"][0]["stderr"]["T"] > 0
+    with place.database.read_session() as session:
+        told = [one.data for one in EventRepository(session).list_after(job.id)]
+    assert "wait for their recordings" in str(told)

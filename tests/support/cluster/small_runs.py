@@ -99,6 +99,9 @@ class Notebook:
     def record_silent_worker(self, text: str) -> None:
         self.told.append(text)
 
+    def record_delay(self, reason: str) -> None:
+        self.told.append(reason)
+
     def record_worker_death(self, run: str, kills: int) -> None:
         self.kills.setdefault(run, []).append(kills)
 
