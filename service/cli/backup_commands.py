@@ -37,8 +37,6 @@ def write_backup(
         except OSError as error:
             fail(f"{file} cannot be written: {error.strerror}")
     _print_report(file, "wrote", report, as_json)
-    if report.missing:
-        raise typer.Exit(1)
 
 
 def restore_backup(
@@ -73,6 +71,7 @@ def _print_report(file: Path, verb: str, report: "BackupReport", as_json: bool) 
                 "objects": report.objects,
                 "object_bytes": report.object_bytes,
                 "missing": report.missing,
+                "damaged": report.damaged,
             }
         )
     else:
@@ -85,3 +84,7 @@ def _print_report(file: Path, verb: str, report: "BackupReport", as_json: bool) 
         )
     for sha256 in report.missing:
         err.print(f"the object store has lost {sha256}", markup=False)
+    for sha256 in report.damaged:
+        err.print(f"damaged, and not in this backup: {sha256}", markup=False)
+    if report.missing or report.damaged:
+        raise typer.Exit(1)

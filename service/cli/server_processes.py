@@ -280,6 +280,9 @@ database_app = typer.Typer(help="Upgrade and check the database.", no_args_is_he
 
 LIBRARY_PACKAGES = ("numpy", "scipy", "numba", "mcap")
 SERVER_PACKAGES = ("ray", "fastapi", "sqlalchemy", "obstore")
+Sample = Annotated[
+    float, typer.Option(min=0.0, max=1.0, help="Share of the objects that are read, at random.")
+]
 Fix = Annotated[bool, typer.Option("--fix", help="Delete objects that no row refers to.")]
 
 
@@ -346,31 +349,47 @@ def require_database(settings: "Settings") -> None:
         )
 
 
-@database_app.command("check", epilog=show_examples("lagid db check", "lagid db check --fix"))
-def check_database(data_dir: DataDir = None, fix: Fix = False, as_json: AsJson = False) -> None:
-    """Compare database and store: revision, lost objects, objects that no row refers to."""
+@database_app.command(
+    "check",
+    epilog=show_examples("lagid db check", "lagid db check --sample 0.05", "lagid db check --fix"),
+)
+def check_database(
+    data_dir: DataDir = None, sample: Sample = 1.0, fix: Fix = False, as_json: AsJson = False
+) -> None:
+    """Check database and store: damage, lost objects, objects that no row refers to."""
     settings = load_settings(data_dir=data_dir)
-    from service.storage import garbage, migrate
+    from service.storage import garbage, integrity, migrate
     from service.storage.objects import open_store
 
     require_database(settings)
     with open_database(settings) as database:
+        faults = integrity.find_faults(database)
+        for fault in faults:
+            err.print(f"the database is damaged: {fault}", markup=False)
         migrate.check_revision(database)
         store = open_store(settings.store_location)
+        read = dict(garbage.find_damaged(store, sample))
+        damaged = sorted(sha256 for sha256, is_damaged in read.items() if is_damaged)
         with database.read_session() as session:
             lost = sorted(garbage.find_lost_hashes(session, store))
             n_orphans = sum(1 for _ in garbage.find_orphans(session, store))
         n_deleted, freed = garbage.delete_orphans(database, store) if fix else (0, 0)
     if as_json:
-        found = {"lost": lost, "without_row": n_orphans}
-        print_json({**found, "deleted": n_deleted, "freed_bytes": freed})
+        found = {"database": faults, "read": len(read), "damaged": damaged, "lost": lost}
+        counts = {"without_row": n_orphans, "deleted": n_deleted, "freed_bytes": freed}
+        print_json({**found, **counts})
     else:
         if fix:
             out.print(f"deleted {n_deleted} objects, {freed} bytes")
-        out.print(f"tables at head; {len(lost)} objects lost; {n_orphans} objects without a row")
+        out.print(
+            f"tables at head; {len(read)} objects read, {len(damaged)} damaged; {len(lost)} lost; "
+            f"{n_orphans} without a row"
+        )
+        for sha256 in damaged:
+            err.print(f"damaged: {sha256}", markup=False)
         for sha256 in lost:
             err.print(f"lost: {sha256}", markup=False)
-    if lost:
+    if faults or damaged or lost:
         raise typer.Exit(1)
 
 

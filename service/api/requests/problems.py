@@ -30,7 +30,7 @@ from service.core.errors import (
 from service.core.process.temporary_files import FULL_DISK_ERRORS, FULL_DISK_MESSAGE
 from service.core.root_path import to_address
 from service.storage.retry import TRANSIENT_ERRORS, is_transient
-from service.storage.storage_errors import InvalidCursor, StorageError
+from service.storage.storage_errors import InvalidCursor, ObjectDamaged, StorageError
 from sysid.core.errors import SysidError, UnreadableFile
 
 log = logging.getLogger(__name__)
@@ -161,6 +161,8 @@ def _handle_storage_error(request: Request, error: Exception) -> Response:
     if isinstance(error, InvalidCursor):
         return error_response(request, InvalidRequest.from_fault("?cursor", str(error)))
     kind, title = STORAGE_KINDS.get(error.status, ("internal", "The service failed"))
+    if isinstance(error, ObjectDamaged):
+        kind, title = "damaged-object", "A stored object is damaged"
     return problem_response(request, error.status, kind, title, str(error))
 
 

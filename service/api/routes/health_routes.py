@@ -29,6 +29,9 @@ PROBLEM_KINDS = {
     "unauthorized": "The request has no valid API key. Send `Authorization: Bearer lagid_…`, or "
     "sign in at /sign-in.",
     "conflict": "The current state of the job does not allow this request.",
+    "damaged-object": "Stored bytes of a recording or of signals have another checksum than when "
+    "they were stored. That is the server's damage: its operator restores the object, or you store "
+    "the same recording again.",
     "internal": "An unexpected error occurred. The server's log has the details.",
     "invalid": "The body or a query value is invalid. `errors` lists every fault. "
     "Type errors come first. Once all types are right, the answer lists the other faults.",

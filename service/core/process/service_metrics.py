@@ -62,6 +62,9 @@ held_jobs = Gauge("lagid_dispatcher_jobs", "Jobs that this dispatcher holds.")
 store_errors = Counter(
     "lagid_store_errors", "Failed calls to the database or to the object store.", ("store",)
 )
+damaged_objects = Counter(
+    "lagid_damaged_objects", "Reads of stored objects whose checksum was another."
+)
 silent_workers = Counter(
     "lagid_silent_workers", "Workers that this dispatcher replaced because they did not answer."
 )

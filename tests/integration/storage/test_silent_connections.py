@@ -14,7 +14,7 @@ from service.core.process import service_metrics
 from service.queue import notifications
 from service.queue.notifications import open_notifier
 from service.repositories.job_rows import QUEUE_CHANNEL
-from service.storage import postgresql
+from service.storage import postgresql, sessions
 from service.storage.retry import is_transient
 from service.storage.sessions import Database
 from tests.support.limits import LIMIT_SECONDS
@@ -133,7 +133,7 @@ def test_what_takes_long_has_no_limit_at_the_server(database: Database) -> None:
 def test_the_wait_for_a_pooled_connection_has_a_limit(
     proxy: SilentProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.storage.sessions.POOL_SECONDS", 0.2)
+    monkeypatch.setattr(sessions, "POOL_SECONDS", 0.2)
     few = Database(proxy.url("postgres"), pool_size=1, max_overflow=0)
     with few.read_session() as session:
         session.execute(text("SELECT 1"))

@@ -338,13 +338,13 @@ def test_runs_wait_while_the_store_of_their_records_is_away_and_other_jobs_go_on
 def test_a_store_that_is_away_is_not_asked_at_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 
-    class Away(ListedRuns):
+    class NeverThere(ListedRuns):
         def load_records(self, key: str) -> Records:
             asked.append(key)
             raise RecordsDelayed("the store is away")
 
     feeder = Scheduler(ScriptedExecutor(fails))
-    feeder.add_job("a", Away([QueuedRun("a0", spec())]), Notebook())
+    feeder.add_job("a", NeverThere([QueuedRun("a0", spec())]), Notebook())
     for _ in range(20):
         assert feeder.run_step(0.0) == ()
     assert len(asked) == 1
