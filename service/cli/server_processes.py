@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -164,15 +165,25 @@ def _run_server(
 
     from service.api.app import create_app
     from service.core.process.logs import configure_logging
+    from service.core.process.loop_watch import LoopWatch, end_if_standing
+    from service.dispatch.supervisor import RESTART_EXIT_CODE
 
     configure_logging(settings.log_format, logging.WARNING, with_access=settings.writes_access_log)
     app = create_app(settings)
 
+    loop, ending = LoopWatch(), threading.Event()
+    end_if_standing(loop, ending, partial(os._exit, RESTART_EXIT_CODE))
+
     class Server(uvicorn.Server):
         """Server that stops open event streams and the dispatcher as soon as it must end."""
 
+        async def on_tick(self, counter: int) -> bool:
+            loop.turn()
+            return await super().on_tick(counter)
+
         def handle_exit(self, sig: int, frame: FrameType | None) -> None:
             _end_in_time(sig)
+            ending.set()
             if supervisor is not None:
                 threading.Thread(target=supervisor.stop, name="end").start()
             parts = getattr(app.state, "parts", None)

@@ -3,7 +3,6 @@
 It is a process of its own (`service.dispatch.process`). Any number of dispatchers share one queue.
 """
 
-import faulthandler
 import gc
 import logging
 import os
@@ -21,7 +20,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.core.errors import Misconfigured
 from service.core.process import service_metrics
 from service.core.process.logs import bind_ids
-from service.core.process.loop_watch import LoopWatch
+from service.core.process.loop_watch import LoopWatch, end_if_standing
 from service.core.settings import Settings
 from service.dispatch.background import BackgroundJobs, DocumentMaker
 from service.dispatch.held_jobs import HeldJob, choose_first_size
@@ -58,8 +57,6 @@ BUSY_SECONDS = 0.2
 STEP_SECONDS = 0.1
 RELEASE_SECONDS = 5.0
 """Time limit for releasing the jobs once the parent or the workers are gone."""
-STANDS_SECONDS = 60.0
-"""A main loop that stands for this time does not return. Each wait has a limit that is shorter."""
 MAX_JOBS = 64
 """Jobs held at a time. They share the workers, and their runs are read when needed. As many again
 may be claimed if they are short or urgent: one identification need not wait for 64 sweeps."""
@@ -498,24 +495,16 @@ def _exit_with_parent(stopping: threading.Event, executor: RayExecutor) -> None:
 def _watch_process(stopping: threading.Event, executor: RayExecutor, loop: LoopWatch) -> None:
     """End the process if the cluster is lost or the main loop stands: the supervisor restarts it.
 
-    It may hang in a call to Ray, or in native code that keeps even this thread from running. A
-    timer of the C library ends it then.
+    It may hang in a call to Ray.
     """
     service_metrics.loop_standing.set_function(lambda: loop.standing_seconds)
 
-    def watch() -> None:
-        while not stopping.wait(IDLE_SECONDS):
-            faulthandler.dump_traceback_later(2 * STANDS_SECONDS, exit=True)
-            if not executor.is_alive():
-                time.sleep(RELEASE_SECONDS)
-                _exit_now(executor)
-            if loop.standing_seconds > STANDS_SECONDS:
-                _log.error("the main loop stands for %g s. What it does follows", STANDS_SECONDS)
-                faulthandler.dump_traceback()
-                _exit_now(executor)
-        faulthandler.cancel_dump_traceback_later()
+    def look() -> None:
+        if not executor.is_alive():
+            time.sleep(RELEASE_SECONDS)
+            _exit_now(executor)
 
-    threading.Thread(target=watch, name="watch", daemon=True).start()
+    end_if_standing(loop, stopping, partial(_exit_now, executor), look)
 
 
 def _exit_now(executor: RayExecutor) -> None:

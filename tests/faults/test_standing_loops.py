@@ -3,15 +3,22 @@
 import signal
 import subprocess
 import sys
+import time
+from pathlib import Path
 
+import httpx
+import pytest
+
+from service.client.embedded import find_free_port
 from service.dispatch.supervisor import RESTART_EXIT_CODE
 from tests.support.limits import LIMIT_SECONDS
 
 STANDING = """
 import sys, threading, time
+from service.core.process import loop_watch
 from service.core.process.loop_watch import LoopWatch
 from service.dispatch import dispatcher
-dispatcher.STANDS_SECONDS, dispatcher.IDLE_SECONDS = 0.5, 0.1
+loop_watch.STANDS_SECONDS, loop_watch.LOOK_SECONDS = 0.5, 0.1
 class Executor:
     def is_alive(self): return True
     def abandon_cluster(self): print("abandoned", flush=True)
@@ -77,3 +84,46 @@ def test_a_web_process_ends_after_a_signal_whatever_its_threads_wait_for() -> No
     _, said = web.communicate(timeout=LIMIT_SECONDS)
     assert web.returncode == 128 + signal.SIGTERM
     assert "stuck" in said
+
+
+SERVE = """
+import asyncio, os, sys, time
+from service.api.routes import health_routes
+from lagid import main
+from service.core.process import loop_watch
+loop_watch.STANDS_SECONDS, loop_watch.LOOK_SECONDS = 1.0, 0.1
+
+async def stand():
+    time.sleep(600)
+
+health_routes.router.add_api_route("/stand", stand)
+sys.argv = ["lagid", "serve", "--no-dispatcher", "--port", sys.argv[1], "--data-dir", sys.argv[2]]
+main()
+"""
+
+
+def is_up(url: str) -> bool:
+    try:
+        return httpx.get(f"{url}/healthz").status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+def test_a_web_process_whose_event_loop_stands_ends_and_tells_where(tmp_path: Path) -> None:
+    port = find_free_port()
+    web = subprocess.Popen(
+        [sys.executable, "-c", SERVE, str(port), str(tmp_path)], stderr=subprocess.PIPE, text=True
+    )
+    url, limit = f"http://127.0.0.1:{port}", time.monotonic() + LIMIT_SECONDS
+    try:
+        while not is_up(url):
+            assert time.monotonic() < limit, "it did not start"
+            time.sleep(0.1)
+        with pytest.raises(httpx.TransportError):
+            httpx.get(f"{url}/stand", timeout=LIMIT_SECONDS)
+        _, said = web.communicate(timeout=LIMIT_SECONDS)
+    finally:
+        web.kill()
+        web.communicate()
+    assert web.returncode == RESTART_EXIT_CODE
+    assert "in stand" in said

@@ -4,10 +4,18 @@ A process that lives is not one that works. So whoever speaks for a loop, such a
 sends heartbeats, asks here first.
 """
 
+import faulthandler
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+_log = logging.getLogger(__name__)
+
+STANDS_SECONDS = 60.0
+"""A loop that stands for this time does not return. Each wait has a limit that is shorter."""
+LOOK_SECONDS = 1.0
 
 _of_thread = threading.local()
 
@@ -60,3 +68,33 @@ def allow_long_step(seconds: float) -> Iterator[None]:
         yield
     finally:
         watch.turn()
+
+
+def end_if_standing(
+    loop: LoopWatch,
+    stopping: threading.Event,
+    end: Callable[[], None],
+    look: Callable[[], None] = lambda: None,
+) -> None:
+    """Watch a loop in a thread until `stopping`, and call `end` if it stands.
+
+    Whoever started the process starts it anew. The log gets the stack of each thread. Native code
+    may keep even the watching thread from running. Then a timer of the C library ends the process.
+
+    Parameters
+    ----------
+    look : callable
+        Is called every second.
+    """
+
+    def watch() -> None:
+        while not stopping.wait(LOOK_SECONDS):
+            faulthandler.dump_traceback_later(2 * STANDS_SECONDS, exit=True)
+            look()
+            if loop.standing_seconds > STANDS_SECONDS:
+                _log.error("the main loop stands for %g s. What it does follows", STANDS_SECONDS)
+                faulthandler.dump_traceback()
+                end()
+        faulthandler.cancel_dump_traceback_later()
+
+    threading.Thread(target=watch, name="watch", daemon=True).start()
