@@ -221,6 +221,17 @@ def test_the_proxy_passes_on_large_recordings_events_and_host() -> None:
     assert text.count("{") == text.count("}")
 
 
+def test_the_proxy_believes_nothing_that_clients_say_of_themselves() -> None:
+    text = (DOCKER / "nginx.conf").read_text()
+    set_here = dict(re.findall(r"proxy_set_header (\S+) (\S+);", text))
+    user = Settings.model_fields["proxy_header"].default
+    assert set_here[user] == set_here["Forwarded"] == set_here["X-Forwarded-Host"] == '""'
+    assert (set_here["X-Forwarded-For"], set_here["X-Forwarded-Proto"]) == (
+        "$remote_addr",
+        "$scheme",
+    )
+
+
 def test_every_setting_named_in_the_compose_file_exists_and_no_secret_has_a_default() -> None:
     text = (DOCKER / "compose.yaml").read_text()
     known = {f"LAGID_{name.upper()}" for name in Settings.model_fields}
