@@ -1,5 +1,7 @@
 """Packs that do not come back are given away once, and no worker that answers is suspected."""
 
+import time
+
 import pytest
 
 from tests.support.cluster.small_runs import ListedRuns, Notebook, spec
@@ -64,7 +66,7 @@ class HangingExecutor(ScriptedExecutor):
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Time:
     made = Time()
-    monkeypatch.setattr(scheduler.time, "monotonic", made)
+    monkeypatch.setattr(time, "monotonic", made)
     return made
 
 
