@@ -47,6 +47,7 @@ def restore_backup(
 ) -> None:
     """Restore a backup into an empty database and store; --force replaces all rows there are."""
     settings = load_settings(data_dir=data_dir)
+    from service.core.process.folder_lock import use_folder
     from service.storage.objects import open_store
     from service.upkeep import backup
 
@@ -55,6 +56,7 @@ def restore_backup(
     settings.prepare_data_folder()
     with (
         lock_data_folder(settings, with_dispatcher=True),
+        use_folder(settings.data_dir, alone=True),
         open_database(settings) as database,
     ):
         store = open_store(settings.store_location)

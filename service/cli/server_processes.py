@@ -55,8 +55,11 @@ def serve(
     settings.check_exposure()
     _prepare_data_folder(settings)
     _check_access(settings)
+    from service.core.process.folder_lock import use_folder
+
     with (
         lock_data_folder(settings, with_dispatcher=with_dispatcher) as lock,
+        use_folder(settings.data_dir),
         open_listener(settings.host, settings.port) as listener,
     ):
         from service.dispatch.supervisor import supervise_dispatcher
@@ -83,9 +86,11 @@ def run_dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
     """Claim jobs and compute them until stopped (`serve` starts a dispatcher itself)."""
     settings = load_settings(data_dir=data_dir, cpus=cpus)
     _prepare_data_folder(settings)
+    from service.core.process.folder_lock import use_folder
     from service.dispatch.process import run_process
 
-    raise typer.Exit(run_process(settings))
+    with use_folder(settings.data_dir):
+        raise typer.Exit(run_process(settings))
 
 
 def lock_data_folder(

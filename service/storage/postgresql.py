@@ -11,13 +11,16 @@ server its own settings; both are described in the manual of PostgreSQL.
 """
 
 import logging
+import os
+import socket
 from collections.abc import Generator, Mapping
 from time import monotonic
 from typing import Any, TypeVar
 
 import psycopg
-from sqlalchemy import Connection, Engine, event
+from sqlalchemy import Connection, Engine, event, text
 from sqlalchemy.engine import Dialect
+from sqlalchemy.orm import Session
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from service.core.process import service_metrics
@@ -38,7 +41,8 @@ SILENCE_SECONDS = STATEMENT_SECONDS + 3.0
 """
 LONG_SECONDS = 3600.0
 """The same for what is known to take long, such as a migration."""
-_KERNEL_LIMITS: dict[str, Any] = {
+_SETTINGS: dict[str, Any] = {
+    "application_name": f"lagid {os.getpid()} of {socket.gethostname()}"[:63],
     "connect_timeout": CONNECT_SECONDS,
     "keepalives": 1,
     "keepalives_idle": 10,
@@ -80,10 +84,10 @@ class LimitedConnection(psycopg.Connection[Any]):
 
     def _give_up(self) -> None:
         service_metrics.silent_connections.inc()
-        text = f"a connection to the database was silent for {self.silence_seconds:g} s"
-        _log.warning("%s, and is replaced", text)
+        told = f"a connection to the database was silent for {self.silence_seconds:g} s"
+        _log.warning("%s, and is replaced", told)
         self.pgconn.finish()
-        raise psycopg.OperationalError(text)
+        raise psycopg.OperationalError(told)
 
 
 def open_connection(engine: Engine) -> LimitedConnection:
@@ -129,8 +133,8 @@ def _connect(
 
 
 def _open_limited(settings: Mapping[str, Any]) -> LimitedConnection:
-    """Open a connection with all limits; the address may name other ones of the kernel."""
-    connection = LimitedConnection.connect(**{**_KERNEL_LIMITS, **settings}, autocommit=True)
+    """Open a connection with all limits; the address may name other settings of libpq."""
+    connection = LimitedConnection.connect(**{**_SETTINGS, **settings}, autocommit=True)
     connection.execute(_SERVER_LIMITS)
     return connection
 
@@ -139,3 +143,13 @@ def _expect_ping(connection: Any, _entry: ConnectionPoolEntry) -> None:
     """Ask a pooled connection whether it lives, before anything else."""
     if connection is not None:
         connection.silence_seconds = PING_SECONDS
+
+
+def list_other_processes(session: Session) -> list[str]:
+    """List the other processes of lagid that have a connection to the database."""
+    others = (
+        "SELECT DISTINCT application_name FROM pg_stat_activity "
+        "WHERE datname = current_database() AND application_name LIKE 'lagid %' "
+        "AND application_name <> current_setting('application_name') ORDER BY 1"
+    )
+    return list(session.scalars(text(others)))

@@ -25,6 +25,7 @@ from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy import Connection
+from sqlalchemy.orm import Session
 
 from service.queue.dispatchers import DispatcherRepository
 from service.storage import migrate
@@ -290,6 +291,11 @@ def _check_target(database: Database, store: ObjectStore, force: bool) -> None:
                     f"the dispatcher {alive[0]} works on this database; stop all processes of "
                     "lagid first"
                 )
+            if others := _list_other_processes(database, session):
+                raise TargetInUse(
+                    f"another process ({others[0]}) uses this database; stop all processes of "
+                    "lagid first"
+                )
             filled = [
                 table.name
                 for table in Base.metadata.sorted_tables
@@ -307,6 +313,15 @@ def _check_target(database: Database, store: ObjectStore, force: bool) -> None:
         raise TargetInUse(
             "the object store is not empty. Restore into another, or add to it with --force"
         )
+
+
+def _list_other_processes(database: Database, session: Session) -> list[str]:
+    """List who else uses a database of PostgreSQL; that of a file is locked by its folder."""
+    if database.is_sqlite:
+        return []
+    from service.storage.postgresql import list_other_processes  # its driver may be absent
+
+    return list_other_processes(session)
 
 
 def _restore_objects(

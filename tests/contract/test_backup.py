@@ -1,5 +1,7 @@
 """Backups hold every row and object, and are restored bit for bit: both databases, both stores."""
 
+import subprocess
+import sys
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
@@ -211,6 +213,33 @@ def test_a_place_with_rows_or_objects_is_refused_without_force(
         DispatcherRepository(session).add_dispatcher("d2", {LEASE_SECONDS_KEY: 30.0})
     with pytest.raises(TargetInUse, match="dispatcher d2"):
         restore_backup(target, other, file, force=True)
+
+
+@pytest.mark.postgres
+def test_a_database_that_another_process_uses_is_not_restored_into(
+    sqlite_database: Database, tmp_path: Path
+) -> None:
+    store = open_store(f"file://{tmp_path}/objects")
+    write_backup(sqlite_database, store, tmp_path / "b.zip")
+    code = "\n".join(
+        (
+            "import sys; from service.storage.sessions import Database",
+            "database = Database(sys.argv[1])",
+            "with database.engine.connect(): print('ready', flush=True); sys.stdin.read()",
+        )
+    )
+    with empty_postgres() as target:
+        migrate.upgrade_database(target)
+        url = target.engine.url.render_as_string(hide_password=False)
+        with subprocess.Popen(
+            [sys.executable, "-c", code, url], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        ) as other:
+            assert other.stdout is not None
+            assert other.stdout.readline() == b"ready\n"
+            with pytest.raises(TargetInUse, match=f"another process .lagid {other.pid} of"):
+                restore_backup(target, store, tmp_path / "b.zip", force=True)
+            other.communicate(b"")
+        restore_backup(target, store, tmp_path / "b.zip", force=True)
 
 
 def test_a_backup_of_an_earlier_revision_is_upgraded(

@@ -9,7 +9,7 @@ import httpx
 
 from service.api.app import create_app
 from service.client.client import Client
-from service.core.process.folder_lock import lock_folder
+from service.core.process.folder_lock import lock_folder, use_folder
 from tests.support.service.commands import CommandResult, check_refusal, run_lagid
 from tests.support.service.web_app import recording, settings_of
 from tests.support.service.web_server import serve_in_thread
@@ -99,6 +99,12 @@ def test_mistakes_in_backup_and_restore_are_one_line(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "b.zip", "w") as archive:
         archive.writestr("a", "b")
     assert "`lagid backup` did not write" in check_refusal(run(folder, "restore", "b.zip"))
+    with use_folder(folder):  # as a web process without a dispatcher
+        assert "a process of lagid uses" in check_refusal(run(folder, "restore", "b.zip"))
+    folder.chmod(0o700)  # else that is told too
+    with use_folder(folder, alone=True):
+        told = check_refusal(run(folder, "serve", "--no-dispatcher", "--port", "0"))
+        assert "`lagid restore` writes" in told
     with lock_folder(folder, "advice") as lock:
         lock.describe_holder("a service")
         assert "a service" in check_refusal(run(folder, "restore", "b.zip"))
