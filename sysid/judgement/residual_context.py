@@ -13,7 +13,7 @@ from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.core.units import format_unit
 from sysid.data.holds import Hold
 from sysid.data.interpolation import interpolate_channel
-from sysid.data.records import Channel, Record
+from sysid.data.records import Channel, Record, keep_outputs
 from sysid.judgement.residual_model import ColumnFit, OutputNoise, ResidualModel
 from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.kernels.signals.past_reads import is_difference, list_delayed_values
@@ -63,6 +63,8 @@ class Candidate:
         Where something changes, s.
     records : sequence of Record, or None
         Records with which the model is fitted again, for moves that are not linear.
+    is_whole : bool
+        Whether these records are all that it says, as another reading is: not a share of them.
     doubtful : collection of str
         Parameters that take its place in the model, whatever the step to it: a time lag that of
         missing parts, and of clocks.
@@ -83,6 +85,7 @@ class Candidate:
     varies: tuple[int, float, float] | None = None
     moment: float | None = None
     records: Sequence[Record] | None = None
+    is_whole: bool = False
     doubtful: Collection[str] = ()
     is_vague: bool = False
     is_added: bool = False
@@ -195,11 +198,8 @@ class ResidualContext:
         steps = _FINER * model.solver.substeps
         if is_difference(model) or steps > MAX_SUBSTEPS:
             return nothing
-        try:
-            added = self.simulate(model=replace_substeps(model, steps)) - self.simulation
-        except SysidError:
-            return nothing
-        return self.weight * added if np.all(np.isfinite(added)) else nothing
+        added = self.compute_effect(model=replace_substeps(model, steps))
+        return nothing if added is None else self.weight * added
 
     @cached_property
     def parameter_numbers(self) -> list[tuple[int, str]]:
@@ -353,21 +353,9 @@ class ResidualContext:
 
     def _select_span(self, begin: float, end: float) -> Problem:
         """Compare no outputs but those from a time up to another one (s), without it."""
-        records = [
-            replace(
-                record,
-                outputs=tuple(
-                    replace(
-                        one,
-                        values=np.where(
-                            (one.times >= begin) & (one.times < end), one.values, np.nan
-                        ),
-                    )
-                    for one in record.outputs
-                ),
-            )
-            for record in self.problem.records
-        ]
+        records = keep_outputs(
+            self.problem.records, lambda one: (one.times >= begin) & (one.times < end)
+        )
         return self.problem.rebuild(records=records, weights=self.problem.output_weights)
 
     @cached_property
@@ -402,6 +390,19 @@ class ResidualContext:
         """
         weights = self.problem.output_weights
         return self._predict(self.problem.rebuild(records=records, model=model, weights=weights))
+
+    def compute_effect(
+        self, records: Sequence[Record] | None = None, model: Model | None = None
+    ) -> FloatArray | None:
+        """Compute what other inputs or another model add to the simulated values (n,).
+
+        None if that is nothing, no number, or not to be simulated.
+        """
+        try:
+            added = self.simulate(records, model) - self.simulation
+        except SysidError:
+            return None
+        return added if np.all(np.isfinite(added)) and added.any() else None
 
     def replace_input(
         self, name: str, change: Callable[[FloatArray], FloatArray], hold: Hold | None = None
@@ -460,14 +461,24 @@ class ResidualContext:
         """
         values = np.zeros(self.times.size)
         for part in self.parts:
-            period = float(np.ptp(part.times)) / max(part.times.size - 1, 1)
             for channel in self.problem.records[part.experiment].inputs:
                 if channel.name == name:
-                    after = _AFTER if channel.effective_hold == "zero" else 0.0
-                    values[part.rows] = interpolate_channel(
-                        channel, part.times + (after - lag) * period
-                    )
+                    values[part.rows] = read_channel(channel, part.times, lag)
         return values
+
+    def choose_columns(self, columns: FloatArray) -> list[int]:
+        """Choose the likeliest of columns (n, q) of the outputs, under white and coloured noise."""
+        model, chosen = self.residual_model, dict[int, None]()
+        weighted = self.weigh(columns)
+        for noise, basis, residual in self._bases:
+            whitened = (weighted if noise is None else model.whiten(weighted, noise))[self._order]
+            own = np.sum(np.square(whitened), axis=0)
+            rest = own - np.sum(np.square(basis.T @ whitened), axis=0)
+            is_own = rest > _OWN_SHARE * own
+            score = np.where(is_own, (residual @ whitened) ** 2 / np.where(is_own, rest, 1.0), 0.0)
+            if score.any():
+                chosen[int(np.argmax(score))] = None
+        return list(chosen)
 
     def find_breaks(self, column: FloatArray) -> list[tuple[float, FloatArray, str]]:
         """Find where a column (n,) most likely begins to count, under white and coloured noise.
@@ -569,11 +580,6 @@ class ResidualContext:
         values = problem.predict(self.theta[None])[0][problem.scored_rows]
         return np.asarray(values)
 
-    def name_part(self, part: ResidualPart) -> str:
-        """Name an output of an experiment."""
-        several = len(self.problem.records) > 1
-        return f"{part.output} of experiment {part.experiment + 1}" if several else part.output
-
     def iterate_outputs(self) -> Iterator[tuple[str, BoolArray, str]]:
         """Iterate over the outputs: name, rows (n,), unit."""
         for output in self.problem.model.outputs:
@@ -583,6 +589,27 @@ class ResidualContext:
                     rows[part.rows] = True
             if rows.any():
                 yield output.name, rows, format_unit(output.unit)
+
+
+def read_channel(channel: Channel, times: FloatArray, lag: float = 0.0) -> FloatArray:
+    """Read a channel at times (n,) of samples, `lag` periods before; missing values are bridged.
+
+    A held one is read after its jump.
+    """
+    channel = channel.acting
+    period = float(np.ptp(times)) / max(times.size - 1, 1)
+    after = _AFTER if channel.effective_hold == "zero" else 0.0
+    return interpolate_known(channel, times + (after - lag) * period)
+
+
+def interpolate_known(channel: Channel, times: FloatArray) -> FloatArray:
+    """Interpolate the values of a channel that are not missing."""
+    known = np.isfinite(channel.values)
+    if not known.all():
+        channel = replace(
+            channel, times=channel.times[known], values=channel.values[known], repeats=None
+        )
+    return interpolate_channel(channel, times)
 
 
 class Refitted(NamedTuple):
