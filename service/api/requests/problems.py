@@ -18,6 +18,7 @@ from service.core.bodies.text_checks import LONE_SURROGATE
 from service.core.bodies.validation import describe_error, explain_errors, find_body_type
 from service.core.errors import (
     Conflict,
+    DamagedObject,
     FieldError,
     InvalidRequest,
     InvalidUpload,
@@ -160,9 +161,9 @@ def _handle_storage_error(request: Request, error: Exception) -> Response:
         return error_response(request, Unavailable(str(error)))
     if isinstance(error, InvalidCursor):
         return error_response(request, InvalidRequest.from_fault("?cursor", str(error)))
-    kind, title = STORAGE_KINDS.get(error.status, ("internal", "The service failed"))
     if isinstance(error, ObjectDamaged):
-        kind, title = "damaged-object", "A stored object is damaged"
+        return error_response(request, DamagedObject(str(error)))
+    kind, title = STORAGE_KINDS.get(error.status, ("internal", "The service failed"))
     return problem_response(request, error.status, kind, title, str(error))
 
 
