@@ -134,6 +134,8 @@ def test_bounds_and_runs_wait_for_a_store_that_is_away(place, monkeypatch):
 
     monkeypatch.setattr(place.store, "get_bytes", refuse)
     monkeypatch.setattr(stored_recordings, "CACHE_SIZE", 0)
+    empty = stored_recordings._RecordingCache()
+    monkeypatch.setattr(stored_recordings, "_recording_cache", empty)
     monkeypatch.setattr(job_parts, "CACHED_SAMPLES", 0)
     (job,) = carry_out_jobs(place, place.submit(**NOISY))
     assert job.state is JobState.SUCCEEDED
