@@ -215,12 +215,12 @@ class JobQueue:
 
     def compute_time_limit(self, handle: PackHandle) -> float:
         """Compute the time after which a pack in flight is not waited for, in s."""
-        items = self.in_flight[handle]
-        runs = [self._active[item.run] for item in items if item.run in self._active]
+        names = {item.run for item in self.in_flight[handle]}
+        runs = [self._active[name] for name in names if name in self._active]
         is_known = self._shared.cost.seconds is not None
         is_again = any(run.kills or run.is_suspect for run in runs)
         longest = self._shared.longest_seconds if is_known and not is_again else None
-        return compute_time_limit(len(items), longest)
+        return compute_time_limit(longest)
 
     def stop_sending(self) -> None:
         """Send nothing more."""

@@ -15,13 +15,18 @@ MIN_LIMIT_SECONDS = 30.0
 """Least limit: a new worker starts within this time on a busy machine, and a swap passes."""
 
 LIMIT_FACTOR = 20.0
-"""An item may take this many times the longest one of its job."""
+"""A pack may take this many times what one with the longest item of its job takes."""
+
+PACK_LIMIT_SECONDS = 1.0
+"""No further item of a pack is started after this time; the rest is returned unchanged."""
 
 Handle = TypeVar("Handle")
 
 
-def compute_time_limit(n_items: int, longest: float | None) -> float:
+def compute_time_limit(longest: float | None) -> float:
     """Compute the time limit of a pack in s.
+
+    A pack begins no item after `PACK_LIMIT_SECONDS`. So the number of its items does not count.
 
     Parameters
     ----------
@@ -29,8 +34,8 @@ def compute_time_limit(n_items: int, longest: float | None) -> float:
         Time of the longest item of its job in s; None while that is unknown.
     """
     if longest is None:
-        return FIRST_LIMIT_SECONDS * n_items
-    return max(MIN_LIMIT_SECONDS, LIMIT_FACTOR * longest * n_items)
+        return FIRST_LIMIT_SECONDS
+    return max(MIN_LIMIT_SECONDS, LIMIT_FACTOR * (PACK_LIMIT_SECONDS + longest))
 
 
 class PackWatch(Generic[Handle]):

@@ -12,6 +12,7 @@ from workers.pack_watch import (
     FIRST_LIMIT_SECONDS,
     LIMIT_FACTOR,
     MIN_LIMIT_SECONDS,
+    PACK_LIMIT_SECONDS,
     PackWatch,
     compute_time_limit,
 )
@@ -79,9 +80,9 @@ def turn(feeder: Scheduler, clock: Time, seconds: float, step: float = 1.0) -> l
 
 
 def test_the_limit_of_a_pack_is_that_of_its_job_and_generous_while_nothing_is_known() -> None:
-    assert compute_time_limit(1, None) == FIRST_LIMIT_SECONDS
-    assert compute_time_limit(3, 0.1) == MIN_LIMIT_SECONDS
-    assert compute_time_limit(3, 5.0) == 15 * LIMIT_FACTOR
+    assert compute_time_limit(None) == FIRST_LIMIT_SECONDS
+    assert compute_time_limit(0.1) == MIN_LIMIT_SECONDS
+    assert compute_time_limit(5.0) == (PACK_LIMIT_SECONDS + 5.0) * LIMIT_FACTOR
 
 
 def test_only_packs_that_compute_have_a_time() -> None:
@@ -151,7 +152,7 @@ def test_a_long_item_of_a_job_gives_the_others_time(clock: Time) -> None:
     executor.answer = long
     feeder = Scheduler(executor)
     jobs(feeder, a=2)
-    turn(feeder, clock, 9.0 * LIMIT_FACTOR - 5)
+    turn(feeder, clock, (PACK_LIMIT_SECONDS + 9.0) * LIMIT_FACTOR - 5)
     assert executor.killed == []
     turn(feeder, clock, 10)
     assert len(executor.killed) == 1
