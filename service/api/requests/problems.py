@@ -28,6 +28,7 @@ from service.core.errors import (
     UnsupportedMediaType,
     to_field_errors,
 )
+from service.core.process import service_metrics
 from service.core.process.temporary_files import FULL_DISK_ERRORS, FULL_DISK_MESSAGE
 from service.core.root_path import to_address
 from service.storage.retry import TRANSIENT_ERRORS, is_transient
@@ -172,6 +173,9 @@ def _handle_database_outage(request: Request, error: Exception) -> Response:
         return _handle_unexpected_error(request, error)
     log.error("%s %s: %s", request.method, request.url.path, str(error).splitlines()[0])
     detail = "the database does not answer, or its disk is full. Nothing was changed. Try again."
+    if isinstance(error, SqlTimeout):
+        service_metrics.store_errors.labels("database").inc()
+        detail = "all connections to the database are in use. Nothing was changed. Try again."
     return error_response(request, Unavailable(detail))
 
 
