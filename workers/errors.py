@@ -32,7 +32,14 @@ class RecordsUnavailable(WorkersError):
 
 
 class RecordsDelayed(WorkersError):
-    """A run's records cannot be loaded now, because their store is away; the message says why."""
+    """A run's records cannot be loaded now; the message says why.
+
+    `seconds` is when to ask again.
+    """
+
+    def __init__(self, reason: str, seconds: float) -> None:
+        super().__init__(reason)
+        self.seconds = seconds
 
 
 class InvalidCheckpoint(WorkersError):

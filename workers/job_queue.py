@@ -34,9 +34,6 @@ MAX_SHARED_RECORDS = 16
 """Largest number of record sets that a job shares with the executor."""
 
 
-DELAY_SECONDS = 5.0
-"""Pause before records are asked for again whose store is away."""
-
 READ_SECONDS_PER_CORE = 4.0
 """Runs that take longer than this together are not read ahead for a core."""
 
@@ -98,8 +95,8 @@ class JobQueue:
         self._active: dict[str, ActiveRun] = {}
         self._shared = shared or SharedWork()
         self._shared.queues.append(self)
-        self._exhausted = self._is_delayed = False
-        self._asked_at = 0.0
+        self._exhausted = False
+        self._delayed_until: float | None = None  # by the elapsed time; its records are not there
         self.has_no_more = False
 
     def leave(self) -> None:
@@ -123,7 +120,7 @@ class JobQueue:
         runs are not read far ahead: another dispatcher may take them. While the store of the
         records is away, no run waits for a worker.
         """
-        if not self._is_delayed or time.monotonic() - self._asked_at >= DELAY_SECONDS:
+        if self._delayed_until is None or time.monotonic() >= self._delayed_until:
             self._read_runs(wanted, deadline)
             return bool(self._ready)
         return False
@@ -249,7 +246,7 @@ class JobQueue:
         try:
             shared = {key: self._share_records(key) for key in keys}
         except RecordsDelayed as error:
-            self._delay_items(items, str(error))
+            self._delay_items(items, error)
             return
         except RecordsUnavailable as error:
             for name in {item.run for item in items}:
@@ -262,11 +259,11 @@ class JobQueue:
         for item in items:
             self._active[item.run].pack_handles.add(handle)
 
-    def _delay_items(self, items: Sequence[WorkItem], reason: str) -> None:
+    def _delay_items(self, items: Sequence[WorkItem], error: RecordsDelayed) -> None:
         """Put the runs of these items back, until their records can be loaded."""
-        if not self._is_delayed:
-            self.observer.record_delay(reason)
-        self._is_delayed, self._asked_at = True, time.monotonic()
+        if self._delayed_until is None:
+            self.observer.record_delay(str(error))
+        self._delayed_until = time.monotonic() + error.seconds
         for name in reversed(dict.fromkeys(item.run for item in items)):
             self._active[name].restart_epoch()
             self._ready.appendleft(self._active[name])
@@ -291,7 +288,7 @@ class JobQueue:
             while len(shared) >= MAX_SHARED_RECORDS:
                 shared.pop(next(iter(shared)))
             shared[key] = self._executor.share_records(self._source.load_records(key))
-            self._is_delayed = False
+            self._delayed_until = None
         return shared[key]
 
     def _take_result(self, run: ActiveRun, result: ItemResult) -> None:

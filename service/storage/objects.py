@@ -45,7 +45,7 @@ _SINGLE_PUT = 64 << 20
 """Largest object in bytes that is sent in one request and thus held in memory."""
 RENEWAL_AGE = timedelta(minutes=30)
 """An object of a bucket that is stored again after this time is written anew."""
-_RETRIES: "RetryConfig" = {"max_retries": 3, "retry_timeout": timedelta(seconds=30)}
+_RETRIES: "RetryConfig" = {"max_retries": 3, "retry_timeout": timedelta(seconds=10)}
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,12 +12,13 @@ from service.dispatch import job_parts, run_cramer_rao
 from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.held_leases import HeldLeases
 from service.repositories.event_rows import EventRepository
+from service.repositories.job_rows import JobRepository
 from service.storage.storage_errors import ObjectStoreFailed
 from service.sweeps.group_cramer_rao import StoredBounds
 from sysid.uncertainty.cramer_rao import cramer_rao_bound
 from tests.support.cluster.inline_executor import InlineExecutor
 from tests.support.limits import LIMIT_SECONDS
-from workers import job_queue
+from tests.support.storage.job_rows import new_job
 
 pytestmark = pytest.mark.slow
 
@@ -122,7 +123,7 @@ SKIPS = [{"path": "/skip", "values": [1, 2]}, {"path": "/skip", "values": [1, 2,
 
 
 def test_bounds_and_runs_wait_for_a_store_that_is_away(place, monkeypatch):
-    monkeypatch.setattr(job_queue, "DELAY_SECONDS", 0.0)
+    monkeypatch.setattr(job_parts, "RETRY_SECONDS", 0.0)
     monkeypatch.setattr(run_cramer_rao, "RETRY_SECONDS", 0.0)
     read, n_refused = place.store.get_bytes, [0]
 
@@ -143,3 +144,30 @@ def test_bounds_and_runs_wait_for_a_store_that_is_away(place, monkeypatch):
     with place.database.read_session() as session:
         told = [one.data for one in EventRepository(session).list_after(job.id)]
     assert "wait for their recordings" in str(told)
+
+
+def test_a_dispatcher_goes_on_while_recordings_are_read(place, monkeypatch):
+    monkeypatch.setattr(job_parts, "LOAD_SECONDS", 0.05)
+    monkeypatch.setattr(job_parts, "ASK_SECONDS", 0.0)
+    empty = stored_recordings._RecordingCache()
+    monkeypatch.setattr(stored_recordings, "_recording_cache", empty)
+    may_go_on, read = threading.Event(), place.store.get_bytes
+
+    def hang(sha256):
+        assert may_go_on.wait(LIMIT_SECONDS)
+        return read(sha256)
+
+    slow = place.submit(algorithm=SMALL)
+    monkeypatch.setattr(place.store, "get_bytes", hang)
+
+    def meanwhile():
+        place.until(slow, JobState.RUNNING)
+        with place.database.write_session() as session:
+            other = JobRepository(session).submit(new_job("other", place.job(slow).spec)).job.id
+            JobRepository(session).cancel(slow)
+        place.until(slow, JobState.CANCELLED)  # the main loop has seen it
+        may_go_on.set()
+        place.until(other, JobState.SUCCEEDED)
+
+    (job,) = carry_out_jobs(place, slow, meanwhile=meanwhile)
+    assert job.state is JobState.CANCELLED

@@ -17,7 +17,7 @@ from tests.support.cluster.small_runs import (
     encode_runs,
     spec,
 )
-from workers import job_queue, packing, scheduler, tasks
+from workers import packing, scheduler, tasks
 from workers.errors import (
     PackCancelled,
     PackFailed,
@@ -311,17 +311,14 @@ def test_a_run_without_records_fails_with_the_reason() -> None:
     assert notebook.failures["a0"][0].reason == "there is no dataset ds_1"
 
 
-def test_runs_wait_while_the_store_of_their_records_is_away_and_other_jobs_go_on(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(job_queue, "DELAY_SECONDS", 0.0)
+def test_runs_wait_while_the_store_of_their_records_is_away_and_other_jobs_go_on() -> None:
     asked: list[str] = []
 
     class Away(ListedRuns):
         def load_records(self, key: str) -> Records:
             asked.append(key)
             if len(asked) < 5:
-                raise RecordsDelayed("the store is away")
+                raise RecordsDelayed("the store is away", 0.0)
             return super().load_records(key)
 
     feeder, waiting = Scheduler(ScriptedExecutor(fails)), Notebook()
@@ -335,13 +332,13 @@ def test_runs_wait_while_the_store_of_their_records_is_away_and_other_jobs_go_on
     assert waiting.begun == ["a0", "a1", "a2"]
 
 
-def test_a_store_that_is_away_is_not_asked_at_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_store_that_is_away_is_not_asked_at_every_step() -> None:
     asked: list[str] = []
 
     class NeverThere(ListedRuns):
         def load_records(self, key: str) -> Records:
             asked.append(key)
-            raise RecordsDelayed("the store is away")
+            raise RecordsDelayed("the store is away", 60.0)
 
     feeder = Scheduler(ScriptedExecutor(fails))
     feeder.add_job("a", NeverThere([QueuedRun("a0", spec())]), Notebook())
