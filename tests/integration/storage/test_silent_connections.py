@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from sqlalchemy import text
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.exc import TimeoutError as NoConnection
 
 from service.core.process import service_metrics
@@ -108,6 +108,21 @@ def test_the_server_ends_statements_and_waits_for_locks(
                 session.execute(text(statement))
             session.rollback()
     assert is_transient(caught.value)
+
+
+def test_a_transaction_whose_client_is_silent_ends_and_may_be_tried_again(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits = "SET idle_in_transaction_session_timeout = 100"
+    monkeypatch.setattr(postgresql, "_SERVER_LIMITS", limits)
+    with database.write_session() as session:
+        session.execute(text("SELECT 1"))
+        time.sleep(0.4)
+        with pytest.raises(DBAPIError) as caught:
+            session.execute(text("SELECT 2"))
+        session.rollback()
+    assert is_transient(caught.value)
+    assert read_one(database) == 1
 
 
 def test_each_connection_has_the_limits_of_server_and_kernel(database: Database) -> None:
