@@ -4,6 +4,7 @@
     - ClusterUnavailable   Ray could not be started or joined
     - ClusterLost          Ray does not answer any more: the process should end and be restarted
     - RecordsUnavailable   a run's records cannot be loaded
+    - RecordsDelayed       a run's records cannot be loaded now, and perhaps later
     - InvalidCheckpoint    a run's checkpoint does not fit its model or its settings
     - PackLost             a pack of work was not finished
         - WorkerDied           its process was killed or ran out of memory
@@ -28,6 +29,17 @@ class ClusterLost(WorkersError):
 
 class RecordsUnavailable(WorkersError):
     """A run's records cannot be loaded; the message is a sentence for its user."""
+
+
+class RecordsDelayed(WorkersError):
+    """A run's records cannot be loaded now; the message says why.
+
+    `seconds` is when to ask again.
+    """
+
+    def __init__(self, reason: str, seconds: float) -> None:
+        super().__init__(reason)
+        self.seconds = seconds
 
 
 class InvalidCheckpoint(WorkersError):

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from workers.active_run import MAX_KILLS, ActiveRun
-from workers.errors import RecordsUnavailable
+from workers.errors import RecordsDelayed, RecordsUnavailable
+from workers.pack_watch import compute_time_limit
 from workers.packing import PACKS_PER_CPU, MeanCost, balance_packs, choose_pack_size
 from workers.protocol import (
     EvolveIsland,
@@ -43,6 +44,10 @@ class SharedWork:
 
     Attributes
     ----------
+    cost : MeanCost
+        That of a run; it has none before the first has ended.
+    longest_seconds : float
+        Time of the longest item.
     records : dict
         Records that the executor has, by key.
     queues : list of JobQueue
@@ -50,6 +55,7 @@ class SharedWork:
     """
 
     cost: MeanCost = field(default_factory=MeanCost)
+    longest_seconds: float = 0.0
     records: dict[str, Any] = field(default_factory=dict)
     queues: "list[JobQueue]" = field(default_factory=list)
 
@@ -90,6 +96,7 @@ class JobQueue:
         self._shared = shared or SharedWork()
         self._shared.queues.append(self)
         self._exhausted = False
+        self._delayed_until: float | None = None  # by the elapsed time; its records are not there
         self.has_no_more = False
 
     def leave(self) -> None:
@@ -110,8 +117,15 @@ class JobQueue:
         """Read runs until `wanted` of them wait or the time is up; return whether a run waits.
 
         A pack of them is read in any case, because small packs would take even more time. Long
-        runs are not read far ahead: another dispatcher may take them.
+        runs are not read far ahead: another dispatcher may take them. While the store of the
+        records is away, no run waits for a worker.
         """
+        if self._delayed_until is None or time.monotonic() >= self._delayed_until:
+            self._read_runs(wanted, deadline)
+            return bool(self._ready)
+        return False
+
+    def _read_runs(self, wanted: int, deadline: float) -> None:
         cost, cores = self._shared.cost.seconds, self._executor.slots
         if cost is not None:
             far = int(READ_SECONDS_PER_CORE * cores / max(cost, 1e-4))
@@ -135,7 +149,6 @@ class JobQueue:
             left -= 1
             if left <= 0 and time.monotonic() > deadline:
                 break
-        return bool(self._ready)
 
     def send_next_pack(self, idle: int) -> None:
         """Send the next pack, or one run's islands as several packs if `idle` cores allow."""
@@ -163,6 +176,7 @@ class JobQueue:
             if run is None:
                 continue  # it failed while another of its islands was in flight
             run.seconds += result.seconds
+            self._shared.longest_seconds = max(self._shared.longest_seconds, result.seconds)
             if run not in waiting:
                 continue
             if result.outcome is not None:
@@ -196,6 +210,15 @@ class JobQueue:
         for run in self._release_runs(handle, self.in_flight.pop(handle)):
             self._fail_run(run.run, RunFailure(reason, "InternalError"))
 
+    def compute_time_limit(self, handle: PackHandle) -> float:
+        """Compute the time after which a pack in flight is not waited for, in s."""
+        names = {item.run for item in self.in_flight[handle]}
+        runs = [self._active[name] for name in names if name in self._active]
+        is_known = self._shared.cost.seconds is not None
+        is_again = any(run.kills or run.is_suspect for run in runs)
+        longest = self._shared.longest_seconds if is_known and not is_again else None
+        return compute_time_limit(longest)
+
     def stop_sending(self) -> None:
         """Send nothing more."""
         self._ready.clear()
@@ -222,6 +245,9 @@ class JobQueue:
         keys = items[0].spec.problem.record_keys
         try:
             shared = {key: self._share_records(key) for key in keys}
+        except RecordsDelayed as error:
+            self._delay_items(items, error)
+            return
         except RecordsUnavailable as error:
             for name in {item.run for item in items}:
                 self._fail_run(name, RunFailure(str(error), type(error).__name__))
@@ -232,6 +258,15 @@ class JobQueue:
         self.in_flight[handle] = tuple(items)
         for item in items:
             self._active[item.run].pack_handles.add(handle)
+
+    def _delay_items(self, items: Sequence[WorkItem], error: RecordsDelayed) -> None:
+        """Put the runs of these items back, until their records can be loaded."""
+        if self._delayed_until is None:
+            self.observer.record_delay(str(error))
+        self._delayed_until = time.monotonic() + error.seconds
+        for name in reversed(dict.fromkeys(item.run for item in items)):
+            self._active[name].restart_epoch()
+            self._ready.appendleft(self._active[name])
 
     def _release_runs(self, handle: PackHandle, items: Sequence[WorkItem]) -> list[ActiveRun]:
         """Release the runs that wait for this pack; others continued without it."""
@@ -253,6 +288,7 @@ class JobQueue:
             while len(shared) >= MAX_SHARED_RECORDS:
                 shared.pop(next(iter(shared)))
             shared[key] = self._executor.share_records(self._source.load_records(key))
+            self._delayed_until = None
         return shared[key]
 
     def _take_result(self, run: ActiveRun, result: ItemResult) -> None:

@@ -322,6 +322,12 @@ class RunObserver(Protocol):
     def record_worker_death(self, run: str, kills: int) -> None:
         """The worker died on this run alone, `kills` times so far; 0: it made progress since."""
 
+    def record_silent_worker(self, text: str) -> None:
+        """A worker did not answer and is replaced, as the text tells."""
+
+    def record_delay(self, reason: str) -> None:
+        """The runs wait, because their records cannot be loaded now."""
+
     def record_progress(self, run: str, state: RunState, seconds: float) -> None:
         """The run can continue from `state` after `seconds` of compute time."""
 
@@ -383,4 +389,4 @@ class JobSource(Protocol):
         """Return the runs, in order; the iterable is read lazily."""
 
     def load_records(self, key: str) -> Records:
-        """Return the records of that key, or raise `RecordsUnavailable`."""
+        """Return the records of that key; else `RecordsUnavailable`, or `RecordsDelayed`."""

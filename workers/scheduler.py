@@ -5,9 +5,10 @@ import time
 from collections.abc import Hashable, Iterable, Mapping
 from typing import Generic, TypeVar
 
-from workers.errors import PackFailed, PackLost
+from workers.errors import PackFailed, PackLost, WorkerDied
 from workers.fair_share import FairShare
 from workers.job_queue import JobQueue, SharedWork
+from workers.pack_watch import PackWatch
 from workers.packing import PACKS_PER_CPU
 from workers.protocol import Executor, JobSource, PackHandle, RunObserver
 
@@ -15,6 +16,12 @@ _log = logging.getLogger(__name__)
 
 GRACE_SECONDS = 1.0
 """After this time, the worker of a cancelled pack is killed."""
+
+CHECK_SECONDS = 1.0
+"""Interval at which packs that do not come back are looked for."""
+
+ABANDON_SECONDS = 10.0
+"""A killed worker that has not ended after this time is not waited for."""
 
 PREFETCH_RUNS_PER_CORE = 64
 """Runs read ahead for each core; the jobs share them."""
@@ -57,6 +64,11 @@ class Scheduler(Generic[Key]):
         self._accounts: dict[Key, Hashable] = {}
         self._shared: dict[Hashable, SharedWork] = {}  # by account
         self._stopped: dict[Key, float] = {}  # time of the stop request; inf once forced
+        self._watch: PackWatch[PackHandle] = PackWatch()
+        self._checked_at = time.monotonic()
+        self._killed: dict[PackHandle, float] = {}  # packs whose workers were killed, and when
+        self._silent: dict[PackHandle, str] = {}  # those of them that were overdue, and how
+        self._abandoned: set[PackHandle] = set()  # those of them that no job waits for
 
     @property
     def is_saturated(self) -> bool:
@@ -99,6 +111,7 @@ class Scheduler(Generic[Key]):
         has_more = self._send_packs()
         for handle in self._executor.wait_for_packs(0.0 if has_more else timeout):
             self._collect_pack(handle)
+        self._replace_silent_workers()
         self._send_packs()
         self._executor.check_cluster_alive()
         ended = tuple(job for job, work in self._jobs.items() if work.is_done)
@@ -195,16 +208,22 @@ class Scheduler(Generic[Key]):
         return self._executor.slots - taken
 
     def _collect_pack(self, handle: PackHandle) -> None:
-        owner = next((j for j, work in self._jobs.items() if handle in work.in_flight), None)
+        owner = self._find_owner(handle)
+        self._killed.pop(handle, None)
+        silence = self._silent.pop(handle, None)
+        is_abandoned = handle in self._abandoned
+        self._abandoned.discard(handle)
         try:
             pack = self._executor.fetch_results(handle)
         except PackLost as error:
             if owner is not None:
-                self._record_lost_task(owner, self._jobs[owner], handle, error)
+                lost = error if silence is None else WorkerDied(silence)
+                self._record_lost_task(owner, self._jobs[owner], handle, lost)
             return
         self.compile_seconds += pack.compile_seconds
-        if owner is None:  # its job has ended
-            _log.warning("a pack of no job came back")
+        if owner is None:  # its job has ended, or did not wait for it
+            if not is_abandoned:
+                _log.warning("a pack of no job came back")
             return
         self._shares.charge_seconds(
             self._accounts[owner], sum(result.seconds for result in pack.results)
@@ -237,3 +256,49 @@ class Scheduler(Generic[Key]):
     def _cancel_packs(self, job: Key, *, force: bool) -> None:
         for handle in self._jobs[job].in_flight:
             self._executor.cancel_pack(handle, force=force)
+            if force:
+                self._killed.setdefault(handle, time.monotonic())
+
+    def _replace_silent_workers(self) -> None:
+        """Kill workers that have a pack beyond its time limit, and give their packs away."""
+        now = time.monotonic()
+        if now - self._checked_at < CHECK_SECONDS:
+            return
+        self._checked_at = now
+        limits = {
+            handle: work.compute_time_limit(handle)
+            for work in self._jobs.values()
+            for handle in work.in_flight
+        }
+        n_cores = self._executor.slots - len(self._abandoned)
+        for handle in self._watch.find_overdue(limits, n_cores, now):
+            if handle not in self._killed:
+                self._killed[handle] = now
+                self._executor.cancel_pack(handle, force=True)
+                self._tell_silence(handle, limits[handle])
+        for handle, killed_at in tuple(self._killed.items()):
+            if now - killed_at > ABANDON_SECONDS:
+                self._abandon_pack(handle)
+
+    def _tell_silence(self, handle: PackHandle, limit: float) -> None:
+        owner = self._find_owner(handle)
+        assert owner is not None
+        work = self._jobs[owner]
+        runs = sorted({item.run for item in work.in_flight[handle]})
+        others = f" and {len(runs) - 1} others" if len(runs) > 1 else ""
+        self._silent[handle] = f"it did not answer for {limit:.0f} s"
+        text = f"a worker did not answer for {limit:.0f} s. Another one computes {runs[0]}{others}"
+        _log.warning("%s: %s", owner, text)
+        work.observer.record_silent_worker(text)
+
+    def _abandon_pack(self, handle: PackHandle) -> None:
+        """Go on without a pack whose worker does not even end."""
+        owner = self._find_owner(handle)
+        del self._killed[handle]
+        self._abandoned.add(handle)
+        if owner is not None:
+            error = WorkerDied(self._silent.pop(handle, "it did not end"))
+            self._record_lost_task(owner, self._jobs[owner], handle, error)
+
+    def _find_owner(self, handle: PackHandle) -> Key | None:
+        return next((job for job, work in self._jobs.items() if handle in work.in_flight), None)

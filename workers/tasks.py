@@ -27,6 +27,7 @@ from sysid.models.parse import parse_model
 from sysid.search.island import Island, get_island_settings, split_population
 from sysid.simulation.problem import Problem, compute_reference_rms
 from workers.errors import InvalidCheckpoint
+from workers.pack_watch import PACK_LIMIT_SECONDS
 from workers.protocol import (
     AdvanceRun,
     CompleteRun,
@@ -46,9 +47,6 @@ from workers.protocol import (
 )
 
 _log = logging.getLogger(__name__)
-
-PACK_LIMIT_SECONDS = 1.0
-"""No further item is started after this time; the rest is returned unchanged."""
 
 MAX_CACHED_PROBLEMS, MAX_CACHED_MODELS = 8, 32
 

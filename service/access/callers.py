@@ -216,8 +216,8 @@ def _find_user(session: Session, settings: Settings, users: tuple[str, ...]) -> 
     if len(users) != 1 or not _is_user_name(users[0]):
         raise Unauthorized(
             f"the proxy must name one user in {settings.proxy_header}, with 1 to "
-            f"{MAX_USER_CHARACTERS} printable characters; found {len(users)} values. Programs "
-            "may send an API key instead"
+            f"{MAX_USER_CHARACTERS} printable characters, without a comma or a space; found "
+            f"{len(users)} values. Programs may send an API key instead"
         )
     user = users[0].strip()
     scope: Scope = "admin" if user.lower() in settings.proxy_admins else "write"
@@ -226,7 +226,10 @@ def _find_user(session: Session, settings: Settings, users: tuple[str, ...]) -> 
 
 
 def _is_user_name(text: str) -> bool:
-    return 1 <= len(text.strip()) <= MAX_USER_CHARACTERS and text.isprintable()
+    """Test a name; with a comma or a space it may be two, of a list or of a folded header."""
+    name = text.strip()
+    is_one = not any(character.isspace() or character == "," for character in name)
+    return 1 <= len(name) <= MAX_USER_CHARACTERS and name.isprintable() and is_one
 
 
 def _is_trusted(settings: Settings, address: str) -> bool:

@@ -116,7 +116,7 @@ def _build_lifespan(settings: Settings):  # type: ignore[no-untyped-def]
         app.state.parts = parts = await run_in_threadpool(open_parts, settings)
         reaper = Reaper(parts.database, parts.stopping)
         keep = KeptDays(jobs=settings.keep_days, audit=settings.keep_audit_days)
-        housekeeper = Housekeeper(parts.database, parts.store, keep, parts.stopping)
+        housekeeper = Housekeeper(parts.database, parts.store, keep, parts.stopping, parts.scrubber)
         reaper.start()
         housekeeper.start()
         try:

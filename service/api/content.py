@@ -10,6 +10,7 @@ import re
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
@@ -140,7 +141,8 @@ def content_response(
     if request.method == "HEAD":
         return Response(status_code=status, headers=headers, media_type=MCAP_TYPE)
     blocks = store.get_stream(sha256, wanted.start, wanted.stop - wanted.start)
-    return McapResponse(blocks, status, headers)
+    first = next(blocks, b"")  # a damaged object is told before the answer begins, or breaks it off
+    return McapResponse(chain((first,), blocks), status, headers)
 
 
 def preflight_response() -> Response:

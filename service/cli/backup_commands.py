@@ -37,8 +37,6 @@ def write_backup(
         except OSError as error:
             fail(f"{file} cannot be written: {error.strerror}")
     _print_report(file, "wrote", report, as_json)
-    if report.missing:
-        raise typer.Exit(1)
 
 
 def restore_backup(
@@ -49,6 +47,7 @@ def restore_backup(
 ) -> None:
     """Restore a backup into an empty database and store; --force replaces all rows there are."""
     settings = load_settings(data_dir=data_dir)
+    from service.core.process.folder_lock import use_folder
     from service.storage.objects import open_store
     from service.upkeep import backup
 
@@ -57,6 +56,7 @@ def restore_backup(
     settings.prepare_data_folder()
     with (
         lock_data_folder(settings, with_dispatcher=True),
+        use_folder(settings.data_dir, alone=True),
         open_database(settings) as database,
     ):
         store = open_store(settings.store_location)
@@ -73,6 +73,7 @@ def _print_report(file: Path, verb: str, report: "BackupReport", as_json: bool) 
                 "objects": report.objects,
                 "object_bytes": report.object_bytes,
                 "missing": report.missing,
+                "damaged": report.damaged,
             }
         )
     else:
@@ -85,3 +86,7 @@ def _print_report(file: Path, verb: str, report: "BackupReport", as_json: bool) 
         )
     for sha256 in report.missing:
         err.print(f"the object store has lost {sha256}", markup=False)
+    for sha256 in report.damaged:
+        err.print(f"damaged, and not in this backup: {sha256}", markup=False)
+    if report.missing or report.damaged:
+        raise typer.Exit(1)

@@ -56,7 +56,7 @@ from service.cli.printed_tables import (
     run_coordinates,
 )
 from service.cli.watch import follow_job
-from service.core.states import JobState
+from service.core.states import JobState, describe_state
 from service.formats.file_kinds import SUFFIXES
 from sysid.core.text import append_unit
 
@@ -151,7 +151,7 @@ def list_jobs(
         lambda job: (
             job["id"],
             job["name"],
-            job["state"],
+            _describe_state(job),
             job["model"],
             _format_progress(job),
             *_single_run_rms(job),
@@ -167,7 +167,14 @@ def _describe_outcome(job: Mapping[str, Any]) -> str | None:
     if job["outcome"] is None:
         return None
     verdict: str = job["outcome"]["verdict"]
-    return f"best run: {verdict}" if job["progress"]["runs"] > 1 else verdict
+    if job["progress"]["runs"] == 1:
+        return verdict
+    failed = f"{_describe_state(job)}; " if job["progress"]["failed"] else ""
+    return f"{failed}best run: {verdict}"
+
+
+def _describe_state(job: Mapping[str, Any]) -> str:
+    return describe_state(job["state"], job["progress"]["failed"], job["progress"]["runs"])
 
 
 def _explain_no_jobs(state: list[JobState] | None, filters: dict[str, Any]) -> str:
@@ -254,9 +261,15 @@ def cancel_job(client: "Client", job: JobName) -> Document:
 
 
 @server_command(_print_state)
-def resume_job(client: "Client", job: JobName) -> Document:
+def resume_job(
+    client: "Client",
+    job: JobName,
+    failed: Annotated[
+        bool, typer.Option("--failed", help="Of a job that has ended, its failed runs alone.")
+    ] = False,
+) -> Document:
     """Queue a failed or cancelled job again; it continues where it stopped."""
-    return client.resume(job)
+    return client.resume(job, failed=failed)
 
 
 @server_command()

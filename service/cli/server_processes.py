@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,7 +29,10 @@ if TYPE_CHECKING:
     from service.storage.sessions import Database
 
 
+_log = logging.getLogger("lagid.web")
+
 SHUTDOWN_SECONDS = 3  # time for open answers once the process is asked to end
+END_SECONDS = 9.0  # then the process ends, whatever its threads wait for
 
 Host = Annotated[str | None, typer.Option(help="Address to listen on.")]
 Port = Annotated[int | None, typer.Option(min=0, max=65535, help="Port; 0 chooses a free one.")]
@@ -51,8 +55,11 @@ def serve(
     settings.check_exposure()
     _prepare_data_folder(settings)
     _check_access(settings)
+    from service.core.process.folder_lock import use_folder
+
     with (
         lock_data_folder(settings, with_dispatcher=with_dispatcher) as lock,
+        use_folder(settings.data_dir),
         open_listener(settings.host, settings.port) as listener,
     ):
         from service.dispatch.supervisor import supervise_dispatcher
@@ -79,9 +86,11 @@ def run_dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
     """Claim jobs and compute them until stopped (`serve` starts a dispatcher itself)."""
     settings = load_settings(data_dir=data_dir, cpus=cpus)
     _prepare_data_folder(settings)
+    from service.core.process.folder_lock import use_folder
     from service.dispatch.process import run_process
 
-    raise typer.Exit(run_process(settings))
+    with use_folder(settings.data_dir):
+        raise typer.Exit(run_process(settings))
 
 
 def lock_data_folder(
@@ -161,14 +170,25 @@ def _run_server(
 
     from service.api.app import create_app
     from service.core.process.logs import configure_logging
+    from service.core.process.loop_watch import LoopWatch, end_if_standing
+    from service.dispatch.supervisor import RESTART_EXIT_CODE
 
     configure_logging(settings.log_format, logging.WARNING, with_access=settings.writes_access_log)
     app = create_app(settings)
 
+    loop, ending = LoopWatch(), threading.Event()
+    end_if_standing(loop, ending, partial(os._exit, RESTART_EXIT_CODE))
+
     class Server(uvicorn.Server):
         """Server that stops open event streams and the dispatcher as soon as it must end."""
 
+        async def on_tick(self, counter: int) -> bool:
+            loop.turn()
+            return await super().on_tick(counter)
+
         def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+            _end_in_time(sig)
+            ending.set()
             if supervisor is not None:
                 threading.Thread(target=supervisor.stop, name="end").start()
             parts = getattr(app.state, "parts", None)
@@ -251,17 +271,34 @@ def _check_access(settings: "Settings") -> None:
 def _exit_on_signals() -> None:
     """End by an exception, so that resources are closed; uvicorn raises the signal again."""
 
-    def end(_signal: int, _frame: FrameType | None) -> None:
+    def end(number: int, _frame: FrameType | None) -> None:
+        _end_in_time(number)
         raise SystemExit(0)
 
     signal.signal(signal.SIGTERM, end)
     signal.signal(signal.SIGINT, end)
 
 
+def _end_in_time(number: int) -> None:
+    """End the process `END_SECONDS` after a signal, even if a thread waits for ever."""
+
+    def end() -> None:
+        standing = ", ".join(sorted(thread.name for thread in threading.enumerate()))
+        _log.error("the process is ended %g s after signal %d: %s", END_SECONDS, number, standing)
+        os._exit(128 + number)  # the code of a process that a signal has ended
+
+    timer = threading.Timer(END_SECONDS, end)
+    timer.daemon = True
+    timer.start()
+
+
 database_app = typer.Typer(help="Upgrade and check the database.", no_args_is_help=True)
 
 LIBRARY_PACKAGES = ("numpy", "scipy", "numba", "mcap")
 SERVER_PACKAGES = ("ray", "fastapi", "sqlalchemy", "obstore")
+Sample = Annotated[
+    float, typer.Option(min=0.0, max=1.0, help="Share of the objects that are read, at random.")
+]
 Fix = Annotated[bool, typer.Option("--fix", help="Delete objects that no row refers to.")]
 
 
@@ -328,31 +365,47 @@ def require_database(settings: "Settings") -> None:
         )
 
 
-@database_app.command("check", epilog=show_examples("lagid db check", "lagid db check --fix"))
-def check_database(data_dir: DataDir = None, fix: Fix = False, as_json: AsJson = False) -> None:
-    """Compare database and store: revision, lost objects, objects that no row refers to."""
+@database_app.command(
+    "check",
+    epilog=show_examples("lagid db check", "lagid db check --sample 0.05", "lagid db check --fix"),
+)
+def check_database(
+    data_dir: DataDir = None, sample: Sample = 1.0, fix: Fix = False, as_json: AsJson = False
+) -> None:
+    """Check database and store: damage, lost objects, objects that no row refers to."""
     settings = load_settings(data_dir=data_dir)
-    from service.storage import garbage, migrate
+    from service.storage import garbage, integrity, migrate
     from service.storage.objects import open_store
 
     require_database(settings)
     with open_database(settings) as database:
+        faults = integrity.find_faults(database)
+        for fault in faults:
+            err.print(f"the database is damaged: {fault}", markup=False)
         migrate.check_revision(database)
         store = open_store(settings.store_location)
+        read = dict(garbage.find_damaged(store, sample))
+        damaged = sorted(sha256 for sha256, is_damaged in read.items() if is_damaged)
         with database.read_session() as session:
             lost = sorted(garbage.find_lost_hashes(session, store))
             n_orphans = sum(1 for _ in garbage.find_orphans(session, store))
         n_deleted, freed = garbage.delete_orphans(database, store) if fix else (0, 0)
     if as_json:
-        found = {"lost": lost, "without_row": n_orphans}
-        print_json({**found, "deleted": n_deleted, "freed_bytes": freed})
+        found = {"database": faults, "read": len(read), "damaged": damaged, "lost": lost}
+        counts = {"without_row": n_orphans, "deleted": n_deleted, "freed_bytes": freed}
+        print_json({**found, **counts})
     else:
         if fix:
             out.print(f"deleted {n_deleted} objects, {freed} bytes")
-        out.print(f"tables at head; {len(lost)} objects lost; {n_orphans} objects without a row")
+        out.print(
+            f"tables at head; {len(read)} objects read, {len(damaged)} damaged; {len(lost)} lost; "
+            f"{n_orphans} without a row"
+        )
+        for sha256 in damaged:
+            err.print(f"damaged: {sha256}", markup=False)
         for sha256 in lost:
             err.print(f"lost: {sha256}", markup=False)
-    if lost:
+    if faults or damaged or lost:
         raise typer.Exit(1)
 
 

@@ -256,9 +256,12 @@ class Operations(Exchange):
         return call("POST /v1/jobs/{}:cancel", job)
 
     @fetch
-    def resume(self, job: str) -> RestCall[documents.JobDocument]:
-        """Queue a failed or cancelled job again, from where it stopped."""
-        return call("POST /v1/jobs/{}:resume", job)
+    def resume(self, job: str, *, failed: bool = False) -> RestCall[documents.JobDocument]:
+        """Queue a failed or cancelled job again, from where it stopped.
+
+        With `failed`, the failed runs alone of a job that has ended.
+        """
+        return call("POST /v1/jobs/{}:resume", job, failed=failed or None)
 
     @fetch
     def clone(self, job: str) -> RestCall[documents.JobDocument]:

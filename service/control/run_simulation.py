@@ -16,7 +16,13 @@ from service.control.loop_answer import (
 from service.core.errors import FieldError, InvalidRequest
 from service.core.process.concurrency import simulation_limit
 from service.datasets.dataset_schemas import DatasetOut
-from service.datasets.datasets import add_recording, hash_source, to_out, to_series
+from service.datasets.datasets import (
+    add_recording,
+    find_existing,
+    hash_source,
+    to_out,
+    to_series,
+)
 from service.datasets.simulated import check_finite_outputs, check_given_delays
 from service.datasets.waveforms import InputSignals, interpolate_channel
 from service.jobs.stored_run import StoredRun, load_estimated_run
@@ -226,7 +232,7 @@ def _store_simulation(
     request = body.model_dump(mode="json", exclude={"name", "store"})
     key = hash_source({"run": run_id, "simulation": request, "values": resolved.values})
     with database.read_session() as session:
-        existing = DatasetRepository(session).find_by_source(key)
+        existing = find_existing(session, store, key)
     if existing is not None:
         return to_out(existing)
     channels = [*result.inputs, *result.outputs]

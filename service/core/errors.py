@@ -16,6 +16,7 @@
         - InvalidUpload           an uploaded file cannot be used
     - QuotaExceeded          429  the project has reached its limit of unfinished work
         - BudgetExceeded          or its limit of stored bytes or of evaluations in a day
+    - DamagedObject          500  the bytes of a stored object have changed
     - Unavailable            503  a component of the service is down
         - ServiceBusy             too many heavy requests
     - Misconfigured               the settings are invalid (command line only)
@@ -258,6 +259,12 @@ class Unavailable(ServiceError):
     def headers(self) -> Mapping[str, str]:
         """When to ask again, in seconds."""
         return {"Retry-After": "1"}
+
+
+class DamagedObject(ServiceError):
+    """The bytes of a stored object have changed: the server's damage, and no fault of a request."""
+
+    status, kind, title = 500, "damaged-object", "A stored object is damaged"
 
 
 class ServiceBusy(Unavailable):

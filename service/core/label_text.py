@@ -19,6 +19,9 @@ _THIN_SPACE = "\u202f"  # narrow no-break space: groups digits and joins a numbe
 _MAX_JSON = 60
 FORMULA_STARTS = (*"=+-@\t\r\n", *"\uff1d\uff0b\uff0d\uff20")  # the last four: full width
 """First characters of formulas in common spreadsheets."""
+_SKIPPED = ' "\u00a0\u2007\u202f\ufeff'
+"""What spreadsheets skip before a formula."""
+_CELL_ENDS = re.compile(r"(?<=[;\n])")
 _NUMBER = re.compile(r"[+-]?[0-9]*\.?[0-9]+([eE][+-]?[0-9]+)?")
 
 
@@ -118,14 +121,24 @@ def write_csv(rows: Iterable[Iterable[object]]) -> str:
 
 
 def _escape_formula(value: object) -> object:
-    """Escape a value so that no spreadsheet evaluates it and no reader splits it into two lines."""
+    """Escape a value so that no spreadsheet evaluates it and no reader splits it into two lines.
+
+    Where the comma is a decimal sign, spreadsheets split lines at semicolons, also within quotes.
+    """
     if not isinstance(value, str):
         return value
-    return ("'" if _is_formula(value) else "") + value.replace("\r", " ")
+    head, *parts = _CELL_ENDS.split(value)
+    escaped = ["'" + part if _is_formula(part) else part for part in parts]
+    return "".join(("'" if _is_formula(value) else "", head, *escaped)).replace("\r", " ")
 
 
 def unescape_formula(text: str) -> str:
-    """Return a text without the apostrophe that `write_csv` put before a formula."""
+    """Return a text without the apostrophes that `write_csv` put before formulas."""
+    head, *parts = _CELL_ENDS.split(text)
+    return _strip_escape("".join((head, *map(_strip_escape, parts))))
+
+
+def _strip_escape(text: str) -> str:
     return text[1:] if text.startswith("'") and _is_formula(text[1:]) else text
 
 
@@ -142,7 +155,9 @@ TEMPLATE_FILTERS = {
 
 
 def _is_formula(text: str) -> bool:
-    return text.startswith(FORMULA_STARTS) and not _NUMBER.fullmatch(text)
+    """Test whether a spreadsheet evaluates a text, also behind quotes and spaces."""
+    shown = text.lstrip(_SKIPPED)
+    return shown.startswith(FORMULA_STARTS) and not _NUMBER.fullmatch(shown.rstrip(";"))
 
 
 def _shorten(text: str) -> str:

@@ -113,6 +113,8 @@ class Settings(BaseSettings):
     (`lagid db keep`). Without it: they are kept."""
     keep_audit_days: float | None = Field(default=None, gt=0, le=36_500)
     """Entries of the audit log are deleted after this number of days. Without it: they are kept."""
+    scrub_days: float = Field(default=30.0, ge=0, le=36_500)
+    """Each stored object is read once in this number of days, to find damage. 0: none is."""
     keep_signals: bool = False
     """Whether sweeps store fitted signals, unless a job says otherwise (`keep_signals`). Else they
     are computed again when they are asked for."""

@@ -21,4 +21,11 @@ class JobState(StrEnum):
         return self not in OPEN_STATES
 
 
+def describe_state(state: str, n_failed: int, n_runs: int) -> str:
+    """Describe the state of a job that has `n_failed` failed runs among `n_runs`."""
+    if state == JobState.SUCCEEDED and n_failed:
+        return f"{n_failed} of {n_runs} failed"
+    return state
+
+
 OPEN_STATES = (JobState.QUEUED, JobState.RUNNING)

@@ -40,8 +40,8 @@ from service.repositories.lineage_rows import (
 )
 from service.repositories.search_conditions import NO_FILTER, ListFilter
 from service.storage.objects import ObjectStore, StoredObject
-from service.storage.sessions import Database
-from service.storage.storage_errors import RowNotFound
+from service.storage.sessions import Database, release_connection
+from service.storage.storage_errors import ObjectDamaged, ObjectMissing, RowNotFound
 from service.storage.tables import Dataset
 from sysid.core.errors import suggest_name
 from sysid.data.records import Channel, Recording
@@ -84,6 +84,26 @@ def resolve_dataset(session: Session, reference: str) -> Dataset | str:
 DatasetKind = Literal["upload", "simulate", "derive"]
 
 
+def find_existing(session: Session, store: ObjectStore, key: str) -> Dataset | None:
+    """Find the dataset of a source; None if its object is missing or damaged: then it is healed."""
+    existing = DatasetRepository(session).find_by_source(key)
+    if existing is not None:
+        release_connection(session)
+        try:
+            store.check_object(existing.sha256)
+        except (ObjectMissing, ObjectDamaged):
+            return None
+    return existing
+
+
+def _heal_object(database: Database, store: ObjectStore, path: Path, sha256: str) -> None:
+    """Store a file as it is if a dataset has it as its object, which is perhaps damaged."""
+    with database.read_session() as session:
+        is_object = DatasetRepository(session).has_object(sha256)
+    if is_object:
+        store.put_file(path)
+
+
 def add_upload(
     database: Database,
     store: ObjectStore,
@@ -114,8 +134,9 @@ def add_upload(
         "sample_time": sample_time,
     }
     key = hash_source(read_as)
+    _heal_object(database, store, path, sha256)
     with database.read_session() as session:
-        existing = DatasetRepository(session).find_by_source(key)
+        existing = find_existing(session, store, key)
     if existing is not None:
         return StoredDataset(existing, is_new=False)
     # Reading takes time. An open transaction would block all others on SQLite.
@@ -148,7 +169,7 @@ def derive_dataset(
         parent = resolve_dataset(session, parent_id)
         if isinstance(parent, str):
             raise DatasetNotFound(parent)
-        existing = DatasetRepository(session).find_by_source(_hash_derivation(parent, body))
+        existing = find_existing(session, store, _hash_derivation(parent, body))
     if existing is not None:
         return StoredDataset(existing, is_new=False)
     from sysid.data.derivations import apply_steps  # brings SciPy's signal processing
@@ -184,7 +205,13 @@ def add_recording(
     parents: Sequence[str] = (),
     relation: Relation = "derived",
 ) -> StoredDataset:
-    """Store a recording: first its object, then the row that refers to it."""
+    """Store a recording: first its object, then the row that refers to it.
+
+    If there is a row of the same source, its object is written once more, and so healed.
+    """
+    with database.read_session() as session:
+        existing = DatasetRepository(session).find_by_source(key)
+    name = name if existing is None else existing.name  # which the file holds too
     # The source of an upload is its file; that of others follows from parents and request.
     file = (details.get("source") or {}).get("sha256", "") if kind == "upload" else ""
     metadata = {"source": file, "source_key": key, "parents": " ".join(parents), "name": name}

@@ -8,9 +8,9 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
 from service.datasets.dataset_schemas import SimulateIn
-from service.datasets.datasets import add_recording, hash_source
+from service.datasets.datasets import add_recording, find_existing, hash_source
 from service.datasets.waveforms import InputSignals
-from service.repositories.dataset_rows import DatasetRepository, StoredDataset
+from service.repositories.dataset_rows import StoredDataset
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
 from sysid.core.errors import InvalidRecord, suggest_name
@@ -31,7 +31,7 @@ def simulate_plant(database: Database, store: ObjectStore, body: SimulateIn) -> 
     """
     key = hash_source(body.model_dump(mode="json", exclude={"name"}))
     with database.read_session() as session:
-        existing = DatasetRepository(session).find_by_source(key)
+        existing = find_existing(session, store, key)
         if existing is not None:
             return StoredDataset(existing, is_new=False)
         if body.plant == "tube":

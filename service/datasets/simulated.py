@@ -10,11 +10,16 @@ from sqlalchemy.orm import Session
 from service.core.errors import FieldError, InvalidRequest
 from service.core.process.concurrency import simulation_limit
 from service.datasets.dataset_schemas import InputIn, SimulateIn
-from service.datasets.datasets import add_recording, describe_recording, hash_source
+from service.datasets.datasets import (
+    add_recording,
+    describe_recording,
+    find_existing,
+    hash_source,
+)
 from service.datasets.plants import simulate_plant
 from service.datasets.waveforms import InputSignals
 from service.models import models
-from service.repositories.dataset_rows import DatasetRepository, StoredDataset, build_dataset_row
+from service.repositories.dataset_rows import StoredDataset, build_dataset_row
 from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
@@ -94,7 +99,7 @@ def simulate_or_find(
         model, document = _resolve_model(session, body.model)
         request = body.model_dump(mode="json", exclude={"name", "plant"})
         key = hash_source({**request, "model": document})
-        existing = DatasetRepository(session).find_by_source(key)
+        existing = find_existing(session, store, key)
         if existing is not None:
             return StoredDataset(existing, is_new=False)
         faults = [

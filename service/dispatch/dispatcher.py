@@ -20,6 +20,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.core.errors import Misconfigured
 from service.core.process import service_metrics
 from service.core.process.logs import bind_ids
+from service.core.process.loop_watch import LoopWatch, end_if_standing
 from service.core.settings import Settings
 from service.dispatch.background import BackgroundJobs, DocumentMaker
 from service.dispatch.held_jobs import HeldJob, choose_first_size
@@ -119,10 +120,13 @@ class Dispatcher:
         try:
             with _spare_from_collection():
                 while not self.stopping.is_set():
+                    self._leases.loop.turn()
                     self.run_round()
         except ClusterLost:
             self._release_jobs(lost=True)
             raise
+        finally:
+            self._leases.loop.end()
         self._scheduler.stop_jobs()
         self._release_jobs()
 
@@ -431,6 +435,7 @@ def serve_jobs(settings: Settings, local: LocalRay | None, start: DispatcherStar
             cluster=None if executor.identity is None else executor,
         )
         _stop_on_signals(dispatcher.stopping, executor)
+        _watch_process(dispatcher.stopping, executor, start.leases.loop)
         dispatcher.run_until_stopped()
     except ClusterLost as error:
         _log.error("%s", error)
@@ -476,7 +481,6 @@ def _stop_on_signals(stopping: threading.Event, executor: RayExecutor) -> None:
     signal.signal(signal.SIGINT, handle)
     if os.environ.get(SUPERVISED_VARIABLE):
         threading.Thread(target=_exit_with_parent, args=(stopping, executor), daemon=True).start()
-    threading.Thread(target=_exit_with_cluster, args=(stopping, executor), daemon=True).start()
 
 
 def _exit_with_parent(stopping: threading.Event, executor: RayExecutor) -> None:
@@ -488,12 +492,19 @@ def _exit_with_parent(stopping: threading.Event, executor: RayExecutor) -> None:
     _exit_now(executor)
 
 
-def _exit_with_cluster(stopping: threading.Event, executor: RayExecutor) -> None:
-    """Exit when the cluster is lost, even if the main thread hangs in a call to Ray."""
-    while not stopping.wait(IDLE_SECONDS):
+def _watch_process(stopping: threading.Event, executor: RayExecutor, loop: LoopWatch) -> None:
+    """End the process if the cluster is lost or the main loop stands: the supervisor restarts it.
+
+    It may hang in a call to Ray.
+    """
+    service_metrics.loop_standing.set_function(lambda: loop.standing_seconds)
+
+    def look() -> None:
         if not executor.is_alive():
             time.sleep(RELEASE_SECONDS)
             _exit_now(executor)
+
+    end_if_standing(loop, stopping, partial(_exit_now, executor), look)
 
 
 def _exit_now(executor: RayExecutor) -> None:

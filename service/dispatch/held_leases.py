@@ -13,6 +13,7 @@ from importlib.metadata import version
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.core.process.loop_watch import LoopWatch
 from service.core.process.process_identity import describe_process
 from service.dispatch.encoding import describe_program
 from service.queue.admission import Admission
@@ -51,6 +52,9 @@ class HeldLeases:
     `n_alive`, the number of living dispatchers, and `cores_of_others`, the cores wanted by those
     that have joined the same cluster.
 
+    A heartbeat says that this dispatcher works. So none is sent while its main loop, which `loop`
+    watches, has not turned since the last one.
+
     Parameters
     ----------
     seconds : float
@@ -71,12 +75,14 @@ class HeldLeases:
         self.owner = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
         self._database, self._length = database, timedelta(seconds=seconds)
         self._clock, self._stopwatch = clock, stopwatch
+        self.loop = LoopWatch(stopwatch)
         self._held: dict[Lease, float] = {}  # when each was renewed
         self._has_asked = False  # a claim was sent and not answered
         self.n_alive = 1
         self.wanted_cores = 0
         self.cores_of_others: dict[str, int] = {}
         self._cluster: str | None = None
+        self._is_standing = False  # the main loop did not turn before the last heartbeat
         self._is_cut_off = False  # the last heartbeat did not reach the database
         self._lock = threading.Lock()
         self._ending = threading.Event()
@@ -233,10 +239,23 @@ class HeldLeases:
         third = self._heartbeat_seconds
         pause = third
         while not self._ending.wait(pause):
+            pause = third
+            if self._tell_standing(third):
+                continue
             try:
                 self.renew_leases()
-                pause, self._is_cut_off = third, False
+                self._is_cut_off = False
             except SQLAlchemyError as error:  # the database may return before the leases end
                 if not self._is_cut_off:
                     _log.warning("no heartbeat could be written: %s", str(error).splitlines()[0])
                 pause, self._is_cut_off = min(third, RETRY_SECONDS), True
+
+    def _tell_standing(self, limit: float) -> bool:
+        """Return whether the main loop stands for longer than `limit` (s); log that it does."""
+        stands = self.loop.standing_seconds > limit
+        if stands and not self._is_standing:
+            _log.warning("no heartbeat is sent, because the main loop stands")
+        elif self._is_standing and not stands:
+            _log.warning("the main loop turns again")
+        self._is_standing = stands
+        return stands

@@ -1,7 +1,9 @@
 """What the parcels of one job share in a dispatcher: specifications, records, warm starts."""
 
+import threading
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, wait
 from functools import partial
 from itertools import islice
 from typing import Any, NamedTuple
@@ -21,18 +23,23 @@ from service.repositories.dataset_rows import DatasetRepository
 from service.storage.objects import ObjectStore
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
-from service.storage.storage_errors import StorageError
+from service.storage.storage_errors import ObjectStoreFailed, StorageError
 from service.storage.tables import Dataset, Job
 from sysid.core.errors import SysidError
 from sysid.core.settings import GeneticAlgorithm
 from sysid.data.noise import Noise
 from sysid.identification.options import RunOptions
 from sysid.models.model import Model
-from workers.errors import RecordsUnavailable
+from workers.errors import RecordsDelayed, RecordsUnavailable
 from workers.protocol import ProblemSpec, Records, RunSpec, WarmStartValues
 
 CACHED_SAMPLES = 1_000_000
 """Samples that a job caches, 16 bytes each, in addition to the latest records."""
+LOAD_SECONDS = 2.0
+"""How long the dispatcher waits for recordings; then it goes on, and asks again soon."""
+ASK_SECONDS = 0.3
+RETRY_SECONDS = 5.0
+"""Pause before an object store is asked again that did not answer."""
 
 
 class DataKey(NamedTuple):
@@ -93,6 +100,7 @@ class JobParts:
         )
         self._database, self._store = database, store
         self._data: dict[str, DataKey] = {}
+        self._loading: dict[str, Future[Records]] = {}
         self._cached_records: OrderedDict[str, Records] = OrderedDict()
         self._groups: list[AxisGroup] | None = None
         self._shared: OrderedDict[str, SharedParts] = OrderedDict()
@@ -140,13 +148,28 @@ class JobParts:
         ------
         RecordsUnavailable
             If a dataset or a channel is missing or invalid.
+        RecordsDelayed
+            If the object store does not answer, as long as that lasts; or if it takes its time.
         """
         if key not in self._cached_records:
-            self._cached_records[key] = self._read_records(key)
+            self._cached_records[key] = self._await_records(key)
             while len(self._cached_records) > 1 and self._count_cached_samples() > CACHED_SAMPLES:
                 self._cached_records.popitem(last=False)
         self._cached_records.move_to_end(key)
         return self._cached_records[key]
+
+    def _await_records(self, key: str) -> Records:
+        """Wait a little for records that a thread reads: a disk or a network may hang."""
+        if key not in self._loading:
+            self._loading[key] = loading = Future[Records]()
+            work = partial(_set_outcome, loading, partial(self._read_records, key))
+            threading.Thread(target=work, name="records", daemon=True).start()
+            wait([loading], LOAD_SECONDS)
+        loading = self._loading[key]
+        if not loading.done():
+            raise RecordsDelayed("they are still being read", ASK_SECONDS)
+        self._loading.pop(key, None)
+        return loading.result()
 
     def _count_cached_samples(self) -> int:
         channels = (
@@ -162,6 +185,8 @@ class JobParts:
         try:
             rows = retry_transient(partial(self._read_datasets, datasets))
             return read_records(self._store, rows, channels)
+        except ObjectStoreFailed as error:
+            raise RecordsDelayed(str(error), RETRY_SECONDS) from error
         except (SysidError, ServiceError, StorageError) as error:
             raise RecordsUnavailable(str(error)) from error
 
@@ -175,6 +200,13 @@ class JobParts:
         key = repr(data)
         self._data[key] = data
         return key
+
+
+def _set_outcome(future: "Future[Records]", work: Callable[[], Records]) -> None:
+    try:
+        future.set_result(work())
+    except BaseException as error:  # noqa: BLE001 - raised by the future
+        future.set_exception(error)
 
 
 def _choose_keeping(job: Job, *, default: bool) -> bool:

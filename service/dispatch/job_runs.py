@@ -6,6 +6,7 @@ from concurrent.futures import Future
 from functools import partial
 
 from service.core.errors import ServiceError
+from service.core.process.loop_watch import allow_long_step
 from service.dispatch.checkpoints import UnreadableCheckpoint, unpack_state
 from service.dispatch.job_parts import JobParts
 from service.dispatch.overlap import RunBeside, run_at_once
@@ -15,7 +16,7 @@ from service.queue.previous_attempts import delete_progress
 from service.queue.reuse import find_computed_runs
 from service.queue.run_writes import RunWriter, WaitingRun
 from service.storage.objects import ObjectStore
-from service.storage.retry import retry_transient
+from service.storage.retry import GIVE_UP_SECONDS, retry_transient
 from service.storage.sessions import Database
 from service.storage.statements import CHUNK_ROWS, split_chunks
 from service.storage.storage_errors import LeaseLost, StorageError
@@ -103,7 +104,8 @@ class JobRuns:
         """Iterate over the runs in order, some at a time. The next ones are read meanwhile."""
         coming: Future[list[WaitingRun]] | None = None
         for window in _split_range(self._numbers):
-            rows = (coming or self._begin_reading(window, run_at_once)).result()
+            with allow_long_step(GIVE_UP_SECONDS):
+                rows = (coming or self._begin_reading(window, run_at_once)).result()
             following = range(window.stop, min(window.stop + CHUNK_ROWS, self._numbers.stop))
             self.n_unread = self._numbers.stop - window.stop
             coming = None
@@ -162,7 +164,7 @@ class JobRuns:
             yield run if source is None else ReusedRun(run.run, source)
 
     def load_records(self, key: str) -> Records:
-        """Load the records of that key, or raise `RecordsUnavailable`."""
+        """Load the records of that key; else `RecordsUnavailable`, or `RecordsDelayed`."""
         return self.parts.load_records(key)
 
     def _read_checkpoints(self) -> dict[str, bytes]:

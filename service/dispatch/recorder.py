@@ -12,6 +12,8 @@ from itertools import accumulate
 from sqlalchemy.orm import Session
 
 from service.core.process import service_metrics
+from service.core.process.logs import bind_ids
+from service.core.process.loop_watch import allow_long_step
 from service.core.states import JobState
 from service.dispatch.checkpoints import pack_state
 from service.dispatch.fitted_signals import store_signals
@@ -29,7 +31,7 @@ from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.history_rows import HistoryPoint, MigrantPoint
 from service.storage.columns import Document
 from service.storage.objects import ObjectStore
-from service.storage.retry import retry_transient
+from service.storage.retry import GIVE_UP_SECONDS, retry_transient
 from service.storage.sessions import Database
 from service.storage.storage_errors import ObjectStoreFailed
 from sysid.islands.run_state import RunState
@@ -101,8 +103,9 @@ class _PendingWrites:
 
     @property
     def has_runs(self) -> bool:
-        """Whether a run has begun, ended or lost its worker."""
-        return bool(self.outcomes or self.packs or self.started or self.reused or self.kills)
+        """Whether a run has begun, ended or lost its worker, or there is something to tell."""
+        ended = self.outcomes or self.packs or self.reused
+        return bool(ended or self.started or self.kills or self.messages)
 
     def count_ended(self) -> int:
         """Count the runs that have ended."""
@@ -226,6 +229,17 @@ class RunRecorder:
     def record_worker_death(self, run: str, kills: int) -> None:
         """Record that the run alone killed its worker, `kills` times since its last progress."""
         self._pending.kills[run] = kills  # written at once: the dispatcher may die too
+
+    def record_silent_worker(self, text: str) -> None:
+        """Record that a worker did not answer and is replaced, as the text tells."""
+        service_metrics.silent_workers.inc()
+        self._pending.messages.append(text)
+
+    def record_delay(self, reason: str) -> None:
+        """Record that runs wait, because their records cannot be loaded now."""
+        with bind_ids(job_id=self.lease.job_id, attempt=self.lease.attempt):
+            _log.warning("runs wait for their recordings: %s", reason)
+        self._pending.messages.append(f"its runs wait for their recordings: {reason}")
 
     def record_progress(self, run: str, state: RunState, seconds: float) -> None:
         """Record a state from which the run can continue."""
@@ -440,7 +454,8 @@ class RunRecorder:
         batch, written = self._written_beside
         self._written_beside = None
         try:
-            written.result()
+            with allow_long_step(GIVE_UP_SECONDS):
+                written.result()
         except BaseException:
             batch.pending.append(self._pending)
             self._pending = batch.pending

@@ -10,6 +10,7 @@ The dispatcher computes them when all runs of the job have ended, so that the we
 
 import logging
 import math
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -42,7 +43,7 @@ from sysid.models.starts import compares_starts
 from sysid.simulation.problem import Problem
 from sysid.simulation.start_values import list_starts
 from sysid.uncertainty.cramer_rao import CramerRaoBound, cramer_rao_bound
-from workers.errors import RecordsUnavailable
+from workers.errors import RecordsDelayed, RecordsUnavailable
 from workers.protocol import ProblemSpec
 from workers.tasks import prepare_run_records
 
@@ -63,6 +64,8 @@ LEFT_OUT_NOTE = (
     f"the sweep has more than {MAX_PROBLEMS} different problems. Only the first {MAX_PROBLEMS} "
     "have Cramér–Rao bounds and reference values"
 )
+RETRY_SECONDS = 1.0
+"""Pause before records are asked for again whose store is away."""
 MAX_WORK = 10_000_000
 """Samples to simulate for the bounds of one job: below a second for most models."""
 
@@ -107,12 +110,16 @@ class _BoundsMaker:
         cells = [dict(zip(axes, key, strict=True)) for key in groups.keys]
         problems = []
         for cell in cells:
-            problems.append(self._describe_problem(cell))
+            while (problem := self._describe_problem(cell)) is None:
+                yield None
+                time.sleep(RETRY_SECONDS)
+            problems.append(problem)
             yield None
         note = LEFT_OUT_NOTE if groups.is_cut else ""
         yield {"axes": axes, "problems": problems, "note": note}
 
-    def _describe_problem(self, cell: Mapping[str, Any]) -> Document:
+    def _describe_problem(self, cell: Mapping[str, Any]) -> Document | None:
+        """Describe the bounds of a cell; None if its records cannot be loaded now."""
         entry: Document = {
             "cell": dict(cell),
             "reference": None,
@@ -126,6 +133,8 @@ class _BoundsMaker:
                 return {**entry, "note": "no run succeeded, so there is no reference for errors"}
             spec = self._parts.share_parts(cell).build_specification(cell).problem
             return {**entry, **self._compute_bounds(spec, entry["reference"]["values"])}
+        except RecordsDelayed:
+            return None
         except (SysidError, ServiceError, StorageError, RecordsUnavailable) as error:
             _log.warning("%s: no Cramér–Rao bound: %s", self._job.id, error)
             return {**entry, "note": f"no Cramér–Rao bound: {error}"}

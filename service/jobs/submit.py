@@ -177,8 +177,10 @@ def check_limits(session: Session, job: Job, settings: Settings) -> None:
     check_daily_evaluations(session, job.project_id, limits.max_daily_evaluations)
 
 
-def resume_job(session: Session, job_id: str, settings: Settings) -> Job:
-    """Queue a failed or cancelled job again.
+def resume_job(
+    session: Session, job_id: str, settings: Settings, *, only_failed: bool = False
+) -> Job:
+    """Queue a failed or cancelled job again; or the failed runs alone of one that has ended.
 
     Raises
     ------
@@ -187,7 +189,7 @@ def resume_job(session: Session, job_id: str, settings: Settings) -> Job:
     QuotaExceeded
         If the project has too much queued and running, or made too many evaluations today.
     """
-    job = JobRepository(session).resume(job_id)
+    job = JobRepository(session).resume(job_id, only_failed=only_failed)
     check_limits(session, job, settings)
     return job
 

@@ -53,9 +53,22 @@ class DispatcherView:
 
 
 def health_page(
-    database: Database, settings: Settings, failures: Mapping[str, str], *, is_admin: bool
+    database: Database,
+    settings: Settings,
+    failures: Mapping[str, str],
+    objects: str,
+    *,
+    is_admin: bool,
 ) -> str:
-    """Render what works and what does not; `failures` are those of ``/readyz``, by their part."""
+    """Render what works and what does not.
+
+    Parameters
+    ----------
+    failures : mapping
+        Those of ``/readyz``, by their part.
+    objects : str
+        What was found when stored objects were read.
+    """
     queue: QueueState | None = None
     dispatchers: Sequence[DispatcherView] = ()
     try:
@@ -71,7 +84,7 @@ def health_page(
         ],
         queue=queue,
         dispatchers=dispatchers,
-        facts=_list_versions(database, settings),
+        facts=[*_list_versions(database, settings), ("stored objects", objects)],
         is_admin=is_admin,
     )
 

@@ -36,7 +36,7 @@ from service.pages.views import (
     to_job_view,
     to_run_view,
 )
-from service.queue.dispatchers import DispatcherRepository, describe_wait
+from service.queue.dispatchers import DispatcherRepository
 from service.repositories.dataset_rows import DatasetRepository
 from service.repositories.event_rows import EventRepository
 from service.repositories.job_rows import JobOrder, JobRepository
@@ -251,7 +251,7 @@ def _describe_obstacle(session: Session, job: Job) -> str:
     """Describe why a job cannot begin; empty if nothing is in its way but other jobs."""
     if job.state is not JobState.QUEUED:
         return ""
-    wait = describe_wait(DispatcherRepository(session).list_alive())
+    wait = DispatcherRepository(session).describe_wait()
     return "" if wait is None else f"This job waits: {wait}."
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from service.core.bodies.job_fields import DATASETS_PATH
 from service.core.bodies.wire import Answer
 from service.core.label_text import format_count, format_value
-from service.core.states import OPEN_STATES, JobState, StateName
+from service.core.states import OPEN_STATES, JobState, StateName, describe_state
 from service.items.items import compute_etag
 from service.jobs.job_schemas import JobOut, OutcomeOut
 from service.jobs.outcomes import is_batch
@@ -65,8 +65,18 @@ class JobView(JobOut):
 
     @property
     def can_resume(self) -> bool:
-        """Whether the job ended before it was done."""
-        return self.state in ("failed", "cancelled")
+        """Whether the job ended before it was done, or with failed runs."""
+        return self.state in ("failed", "cancelled") or self.has_failed_runs
+
+    @property
+    def has_failed_runs(self) -> bool:
+        """Whether some of the runs of a job that succeeded have failed."""
+        return self.state == "succeeded" and self.progress.failed > 0
+
+    @property
+    def state_text(self) -> str:
+        """State in words."""
+        return describe_state(self.state, self.progress.failed, self.progress.runs)
 
     @property
     def is_batch(self) -> bool:

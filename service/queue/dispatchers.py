@@ -1,6 +1,6 @@
 """Heartbeats of the dispatchers."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from datetime import timedelta
 from typing import Literal
 
@@ -16,6 +16,10 @@ _FORGET_AFTER = timedelta(days=1)
 _NO_DISPATCHER = (
     "no dispatcher is alive; jobs are accepted, but wait until one starts. A first start compiles "
     "the search, which takes about a minute"
+)
+_SILENT_DISPATCHER = (
+    "no dispatcher is alive: the last heartbeat of {} is {:.0f} s old. It has ended, its main loop "
+    "stands, or it does not reach the database. Jobs are accepted, but wait for it"
 )
 LEASE_SECONDS_KEY = "lease_seconds"
 """Key of the lease length in the details of a dispatcher."""
@@ -72,6 +76,19 @@ class DispatcherRepository:
             if dispatcher.seen_at >= now - find_lease_length(dispatcher)
         ]
 
+    def describe_wait(self) -> str | None:
+        """Describe why jobs wait for a dispatcher; None if one is alive and ready."""
+        starts = [describe_start(one) for one in self.list_alive()]
+        if None in starts:
+            return None
+        if starts:
+            return f"{starts[0]}; jobs are accepted, but wait for it"
+        latest = max(self.list_all(), key=lambda one: one.seen_at, default=None)
+        if latest is None:
+            return _NO_DISPATCHER
+        age = self._clock() - latest.seen_at
+        return _SILENT_DISPATCHER.format(latest.owner, age.total_seconds())
+
 
 def count_wanted_cores(
     dispatchers: Iterable[DispatcherHeartbeat], cluster: str | None
@@ -105,11 +122,3 @@ def describe_start(dispatcher: DispatcherHeartbeat) -> str | None:
     seconds = (dispatcher.seen_at - dispatcher.started_at).total_seconds()
     waits = " and ".join(_STEPS.get(step, step) for step in steps)
     return f"a dispatcher is starting ({seconds:.0f} s): {waits}"
-
-
-def describe_wait(alive: Sequence[DispatcherHeartbeat]) -> str | None:
-    """Describe why jobs wait for a dispatcher; None if one of these is ready."""
-    starts = [describe_start(one) for one in alive]
-    if None in starts:
-        return None
-    return f"{starts[0]}; jobs are accepted, but wait for it" if starts else _NO_DISPATCHER

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 POLL_SECONDS = 1.0
 _FILE_POLL_SECONDS = 0.05
+QUIET_SECONDS = 10.0
+"""A connection that tells nothing for this time is asked whether it lives."""
 
 
 class Notifier(ABC):
@@ -93,6 +95,7 @@ class _PostgresqlNotifier(Notifier):
     def __init__(self, database: Database, stop: threading.Event) -> None:
         self._database, self._stop = database, stop
         self._connection: psycopg.Connection | None = None
+        self._heard_at = 0.0
 
     def wait_for_change(self, seconds: float = POLL_SECONDS) -> bool:
         from psycopg import OperationalError
@@ -116,16 +119,19 @@ class _PostgresqlNotifier(Notifier):
         while not self._stop.is_set() and (left := deadline - time.monotonic()) > 0:
             notifications = connection.notifies(timeout=min(left, 0.2), stop_after=1)
             if any(True for _ in notifications):
+                self._heard_at = time.monotonic()
                 return True
+        if time.monotonic() - self._heard_at > QUIET_SECONDS:
+            connection.execute("SELECT 1")
+            self._heard_at = time.monotonic()
         return self._stop.is_set()
 
     def _open_connection(self) -> None:
-        url = self._database.engine.url.set(drivername="postgresql")
-        address = url.render_as_string(hide_password=False)
-        from psycopg import connect
+        from service.storage.postgresql import open_connection
 
-        self._connection = connect(address, autocommit=True)
+        self._connection = open_connection(self._database.engine)
         self._connection.execute(f"LISTEN {QUEUE_CHANNEL}")
+        self._heard_at = time.monotonic()
 
 
 # Built once: building a statement costs more than executing it.

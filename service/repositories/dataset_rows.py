@@ -98,6 +98,11 @@ class DatasetRepository:
         query = select(Dataset).where(*self._filter_project(), Dataset.source_key == source_key)
         return self._session.scalar(query)
 
+    def has_object(self, sha256: str) -> bool:
+        """Return whether an object is that of a dataset."""
+        query = select(Dataset.id).where(*self._filter_project(), Dataset.sha256 == sha256)
+        return self._session.scalar(query.limit(1)) is not None
+
     def get(self, dataset_id: str) -> Dataset:
         """Return an undeleted dataset of this project; else raise `RowNotFound`."""
         dataset = self._session.get(Dataset, dataset_id, populate_existing=True)

@@ -239,22 +239,29 @@ class JobRepository:
         self._session.flush()
         return job
 
-    def resume(self, job_id: str) -> Job:
+    def resume(self, job_id: str, *, only_failed: bool = False) -> Job:
         """Queue a failed or cancelled job again; successful runs keep their results.
 
-        Only this request of a user leaves a terminal state.
+        Only this request of a user leaves a terminal state. With `only_failed` it takes the failed
+        runs alone, also of a job that has succeeded.
+
+        Raises
+        ------
+        RowConflict
+            If there is nothing to resume.
         """
         job = self._lock_job(job_id)
-        if job.state not in (JobState.FAILED, JobState.CANCELLED):
-            raise RowConflict(
-                f"{job_id} is {job.state}; only a failed or cancelled job can be resumed"
-            )
-        others = [state for state in JobState if state is not JobState.SUCCEEDED]
-        unsuccessful = update(Run).where(
-            Run.job_id == job_id, Run.state.in_(others), Run.deleted_at.is_(None)
+        again = [state for state in JobState if state is not JobState.SUCCEEDED]
+        allowed = [JobState.FAILED, JobState.CANCELLED]
+        if only_failed:
+            again, allowed = [JobState.FAILED], [JobState.FAILED, JobState.SUCCEEDED]
+        if job.state not in allowed or (only_failed and not job.n_failed):
+            raise RowConflict(_explain_no_resume(job, only_failed=only_failed))
+        chosen = update(Run).where(
+            Run.job_id == job_id, Run.state.in_(again), Run.deleted_at.is_(None)
         )
         self._session.execute(
-            unsuccessful.values(state=JobState.QUEUED, error=None, finished_at=None, kills=0),
+            chosen.values(state=JobState.QUEUED, error=None, finished_at=None, kills=0),
             execution_options=RETURNING_OPTIONS,
         )
         if job.finished_at is not None and job.finished_at <= utc_now() - DAY:
@@ -434,3 +441,12 @@ def notify_queue(session: Session) -> None:
     """Wake the dispatchers when this transaction commits. With SQLite they poll."""
     if session.get_bind().dialect.name == "postgresql":
         session.execute(text("SELECT pg_notify(:channel, '')"), {"channel": QUEUE_CHANNEL})
+
+
+def _explain_no_resume(job: Job, *, only_failed: bool) -> str:
+    if only_failed and job.state.is_terminal and not job.n_failed:
+        return f"no run of {job.id} has failed"
+    if only_failed:
+        return f"{job.id} is {job.state}; failed runs are resumed once a job has ended by itself"
+    advice = "; add failed=true for its failed runs" if job.n_failed else ""
+    return f"{job.id} is {job.state}; only a failed or cancelled job can be resumed{advice}"

@@ -19,8 +19,8 @@ from service.jobs.stored_run import StoredRun, load_run
 from service.runs.run_schemas import ExperimentOut, ResponseOut
 from service.storage.objects import ObjectStore
 from service.storage.sessions import release_connection
-from service.storage.storage_errors import ObjectMissing, RowNotFound
-from sysid.core.errors import SysidError
+from service.storage.storage_errors import ObjectDamaged, ObjectMissing, RowNotFound
+from sysid.core.errors import SysidError, UnreadableFile
 from sysid.data.records import Channel
 
 _CACHE_SIZE = 4
@@ -37,7 +37,7 @@ def load_fitted_signals(
 
     Raises
     ------
-    ObjectMissing, ObjectStoreFailed
+    ObjectMissing, ObjectDamaged, ObjectStoreFailed
         If the object is not there, or cannot be read.
     Conflict
         If they are not stored and cannot be computed again.
@@ -62,7 +62,10 @@ def _read_object(
     """Read the signals of an object, which never changes."""
     if start is None or size is None:
         return read_fitted_outputs(store.get_bytes(sha256))
-    return read_fitted_outputs(store.get_range(sha256, start, size))
+    try:
+        return read_fitted_outputs(store.get_range(sha256, start, size))
+    except UnreadableFile as error:  # a part of an object has checksums of its own
+        raise ObjectDamaged(sha256) from error
 
 
 def _compute_signals(

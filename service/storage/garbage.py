@@ -3,6 +3,7 @@
 Store and tables are compared in parts, so that memory does not grow with the number of objects.
 """
 
+import random
 from collections.abc import Collection, Iterator
 from datetime import datetime, timedelta
 from itertools import product
@@ -13,8 +14,9 @@ from sqlalchemy.orm import Session
 
 from service.storage.columns import utc_now
 from service.storage.objects import RENEWAL_AGE, ObjectStore, StoredObject
-from service.storage.sessions import Database
+from service.storage.sessions import Database, release_connection
 from service.storage.statements import split_chunks
+from service.storage.storage_errors import ObjectDamaged, ObjectMissing
 from service.storage.tables import Dataset, Job, Run
 
 MINIMUM_AGE = 2 * RENEWAL_AGE
@@ -35,6 +37,7 @@ def find_orphans(
     )
     for items in split_chunks(old):
         named = _find_named_hashes(session, [item.sha256 for item in items], limit)
+        release_connection(session)  # the store may take its time
         yield from (item for item in items if item.sha256 not in named)
 
 
@@ -46,9 +49,24 @@ def find_lost_hashes(session: Session, store: ObjectStore) -> Iterator[str]:
             column = query.selected_columns[0]
             part = query.where(column >= prefix, column < f"{prefix}g").distinct()
             named.update(session.scalars(part))
+        release_connection(session)  # the store may take its time
         # Listed after the rows were read: an object is written before its row.
         named.difference_update(item.sha256 for item in store.list_objects(prefix))
         yield from sorted(filter(None, named))
+
+
+def find_damaged(store: ObjectStore, share: float = 1.0) -> Iterator[tuple[str, bool]]:
+    """Read the objects, or a random share of them; yield each hash and whether it is damaged."""
+    for item in store.list_objects():
+        if share >= 1.0 or random.random() < share:
+            try:
+                store.check_object(item.sha256)
+            except ObjectDamaged:
+                yield item.sha256, True
+            except ObjectMissing:  # it was deleted meanwhile
+                continue
+            else:
+                yield item.sha256, False
 
 
 def delete_orphans(

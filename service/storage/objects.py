@@ -7,6 +7,7 @@ storing the bytes of an old object again makes it young.
 """
 
 import hashlib
+import logging
 import os
 import re
 import tempfile
@@ -24,11 +25,18 @@ from obstore.exceptions import AlreadyExistsError, BaseError, NotFoundError
 from obstore.store import LocalStore, S3Store
 
 from service.core.process import service_metrics, temporary_files
-from service.storage.storage_errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
+from service.storage.storage_errors import (
+    InvalidStoreUrl,
+    ObjectDamaged,
+    ObjectMissing,
+    ObjectStoreFailed,
+)
 
 if TYPE_CHECKING:
     from obstore.store import RetryConfig
 
+
+_log = logging.getLogger(__name__)
 
 _ROOT = "sha256"
 _HASH = re.compile(r"[0-9a-f]{64}")
@@ -37,7 +45,7 @@ _SINGLE_PUT = 64 << 20
 """Largest object in bytes that is sent in one request and thus held in memory."""
 RENEWAL_AGE = timedelta(minutes=30)
 """An object of a bucket that is stored again after this time is written anew."""
-_RETRIES: "RetryConfig" = {"max_retries": 3, "retry_timeout": timedelta(seconds=30)}
+_RETRIES: "RetryConfig" = {"max_retries": 3, "retry_timeout": timedelta(seconds=10)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +68,16 @@ class ObjectStore(ABC):
         with path.open("rb") as file:
             return self.put_stream(_read_blocks(file))
 
-    def put_stream(self, blocks: Iterable[bytes]) -> StoredObject:
-        """Store blocks of bytes as they arrive; they are never in memory all at once."""
+    def put_stream(self, blocks: Iterable[bytes], expected: str | None = None) -> StoredObject:
+        """Store blocks of bytes as they arrive; they are never in memory all at once.
+
+        An object that is there is renewed, or healed if it is damaged.
+
+        Raises
+        ------
+        ObjectDamaged
+            If the bytes do not have the `expected` hash. Nothing is stored.
+        """
         digest, size = hashlib.sha256(), 0
         with _translate_errors("write an object"), self._open_temporary_file() as file:
             for block in blocks:
@@ -70,29 +86,67 @@ class ObjectStore(ABC):
             file.flush()
             os.fsync(file.fileno())
             sha256 = digest.hexdigest()
-            self._publish(Path(file.name), _build_object_name(sha256), size)
+            if expected not in (None, sha256):
+                raise ObjectDamaged(str(expected))
+            self._publish(Path(file.name), sha256, size)
         return StoredObject(sha256, size)
 
     def get_bytes(self, sha256: str) -> bytes:
-        """Return a whole object; `ObjectMissing` if it does not exist."""
+        """Return a whole object.
+
+        Raises
+        ------
+        ObjectMissing
+            If it does not exist.
+        ObjectDamaged
+            If its bytes are not those that were stored.
+        """
         with _translate_errors("read an object", sha256):
-            return bytes(obstore.get(self._backend, _build_object_name(sha256)).bytes())
+            data = bytes(obstore.get(self._backend, _build_object_name(sha256)).bytes())
+        _check_digest(sha256, hashlib.sha256(data))
+        return data
 
     def get_range(self, sha256: str, start: int, length: int) -> bytes:
         """Return `length` bytes from `start`; fewer at the end of the object."""
         length = min(length, self.get_size(sha256) - start)
-        if length <= 0:
-            return b""
+        return self._read_range(sha256, start, length) if length > 0 else b""
+
+    def _read_range(self, sha256: str, start: int, length: int) -> bytes:
         with _translate_errors("read an object", sha256):
             name = _build_object_name(sha256)
             return bytes(obstore.get_range(self._backend, name, start=start, length=length))
 
     def get_stream(self, sha256: str, start: int = 0, length: int | None = None) -> Iterator[bytes]:
-        """Yield the bytes of an object from `start`, in blocks."""
-        end = self.get_size(sha256) if length is None else start + length
-        while start < end and (block := self.get_range(sha256, start, min(_BLOCK, end - start))):
-            yield block
+        """Yield the bytes of an object from `start`, in blocks.
+
+        A whole object is checked: its last block comes only if all of its bytes are right.
+
+        Raises
+        ------
+        ObjectMissing
+            If it does not exist.
+        ObjectDamaged
+            If its bytes are not those that were stored.
+        """
+        size = self.get_size(sha256)
+        end = size if length is None else min(size, start + length)
+        is_whole, digest, held = (start == 0 and end == size), hashlib.sha256(), b""
+        while start < end:
+            block = self._read_range(sha256, start, min(_BLOCK, end - start))
+            digest.update(block)
             start += len(block)
+            if held:
+                yield held
+            held = block
+        if is_whole:
+            _check_digest(sha256, digest)
+        if held:
+            yield held
+
+    def check_object(self, sha256: str) -> None:
+        """Read an object; raise `ObjectMissing` or `ObjectDamaged` unless it is whole."""
+        for _ in self.get_stream(sha256):
+            pass
 
     def get_size(self, sha256: str) -> int:
         """Return the size in bytes; `ObjectMissing` if the object does not exist."""
@@ -126,8 +180,18 @@ class ObjectStore(ABC):
         """Raise `ObjectStoreFailed` unless an object could be written now."""
 
     @abstractmethod
-    def _publish(self, source: Path, name: str, size: int) -> None:
-        """Turn a finished, synced file into an object; never replace one of the same name."""
+    def _publish(self, source: Path, sha256: str, size: int) -> None:
+        """Turn a finished, synced file into an object; replace one only if it is damaged."""
+
+    def _is_whole(self, sha256: str) -> bool:
+        try:
+            self.check_object(sha256)
+        except ObjectDamaged:
+            _log.warning("the stored object %s is damaged. It is healed by the same bytes", sha256)
+            return False
+        except ObjectMissing:
+            return False
+        return True
 
     @contextmanager
     def _open_temporary_file(self) -> Iterator[BinaryIO]:
@@ -159,11 +223,17 @@ class FolderStore(ObjectStore):
         with _translate_errors("write"), self._open_temporary_file() as file:
             file.write(b"probe")
 
-    def _publish(self, source: Path, name: str, size: int) -> None:
-        target = self._folder / name
+    def _publish(self, source: Path, sha256: str, size: int) -> None:
+        target = self._folder / _build_object_name(sha256)
         target.parent.mkdir(parents=True, exist_ok=True)
-        while not _link_or_touch(source, target):
-            pass
+        while not _link(source, target):
+            with suppress(FileNotFoundError):  # it has just gone
+                os.utime(target)  # from now on it stays
+                if not self._is_whole(sha256):
+                    healthy = source.with_name(f"{source.name}-{sha256}")
+                    os.link(source, healthy)
+                    os.replace(healthy, target)
+                break
         _sync_folder(target.parent)
         if target.parent not in self._synced:  # its creator may not have synced its parents
             for folder in (target.parent.parent, self._folder):
@@ -189,15 +259,12 @@ class FolderStore(ObjectStore):
         return False
 
 
-def _link_or_touch(source: Path, target: Path) -> bool:
-    """Link a file into place, or renew the one that is there; False if that has just gone."""
+def _link(source: Path, target: Path) -> bool:
+    """Link a file into place; False if there is one already."""
     try:
         os.link(source, target)
-    except FileExistsError:  # another writer stored the same bytes
-        try:
-            os.utime(target)
-        except FileNotFoundError:
-            return False
+    except FileExistsError:
+        return False
     return True
 
 
@@ -221,12 +288,13 @@ class BucketStore(ObjectStore):
             obstore.put(self._backend, "probe", b"probe")
             obstore.delete(self._backend, "probe")
 
-    def _publish(self, source: Path, name: str, size: int) -> None:
+    def _publish(self, source: Path, sha256: str, size: int) -> None:
+        name = _build_object_name(sha256)
         if size <= _SINGLE_PUT:
             with suppress(AlreadyExistsError):  # another writer stored the same bytes
                 obstore.put(self._backend, name, source, mode="create", use_multipart=False)
                 return
-        if self._is_young(name):
+        if self._is_young(name) and self._is_whole(sha256):
             return
         # Written anew, an object is young. A multipart put cannot be create-only; a rival writes
         # the same bytes to this name.
@@ -258,6 +326,13 @@ def open_store(url: str, **options: Any) -> ObjectStore:
     if parts.scheme == "s3":
         return BucketStore(url, **options)
     raise InvalidStoreUrl(url, "use file:///folder or s3://bucket/prefix")
+
+
+def _check_digest(sha256: str, digest: Any) -> None:
+    """Raise `ObjectDamaged` unless the bytes that were read have the right hash."""
+    if digest.hexdigest() != sha256:
+        service_metrics.damaged_objects.inc()
+        raise ObjectDamaged(sha256)
 
 
 def _build_object_name(sha256: str) -> str:

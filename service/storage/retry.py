@@ -6,12 +6,14 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
+from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError
+
+from service.core.process.loop_watch import report_turn
 
 _log = logging.getLogger(__name__)
 
 T = TypeVar("T")
-TRANSIENT_ERRORS = (OperationalError, InterfaceError)
+TRANSIENT_ERRORS = (OperationalError, InterfaceError, InternalError)
 """Errors of SQLAlchemy for a failing database; some drivers raise them for mistakes too."""
 
 _SQLITE_CODES = frozenset(
@@ -26,8 +28,9 @@ _SQLITE_CODES = frozenset(
         sqlite3.SQLITE_PROTOCOL,
     )
 )
-_POSTGRESQL_STATES = ("08", "40", "53", "55P03", "57", "58")
-"""Connection, deadlock, resources such as disk and memory, lock timeout, shutdown, I/O."""
+_POSTGRESQL_STATES = ("08", "25P03", "40", "53", "55P03", "57", "58")
+"""Connection, idle transaction, deadlock, resources such as disk and memory, lock timeout,
+shutdown, I/O."""
 
 PAUSE_SECONDS = 0.3
 GIVE_UP_SECONDS = 60.0
@@ -58,7 +61,7 @@ def retry_transient(work: Callable[[], T]) -> T:
 
     Raises
     ------
-    OperationalError, InterfaceError
+    OperationalError, InterfaceError, InternalError
         After `GIVE_UP_SECONDS`.
     """
     start = time.monotonic()
@@ -72,6 +75,7 @@ def retry_transient(work: Callable[[], T]) -> T:
             if not is_logged:
                 _log.warning("the database does not answer: %s", str(error).splitlines()[0])
             is_logged = True
+            report_turn()
             time.sleep(PAUSE_SECONDS)
         else:
             if is_logged:

@@ -4,7 +4,7 @@ import copy
 import os
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +14,7 @@ from sqlalchemy import Connection, Engine, create_engine, event, make_url
 from sqlalchemy.engine.interfaces import DBAPIConnection, ExceptionContext
 from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.orm import Session, sessionmaker
-from sqlalchemy.pool import ConnectionPoolEntry
+from sqlalchemy.pool import ConnectionPoolEntry, QueuePool
 
 from service.core.extras import check_extra
 from service.core.process import service_metrics
@@ -23,13 +23,15 @@ from service.storage.retry import is_transient
 from service.storage.tables import DEFAULT_PROJECT
 
 BUSY_SECONDS = 30.0
-CONNECT_SECONDS = 5
+POOL_SECONDS = 10.0
+"""Longest wait for a connection of the pool, while others of this process have them all."""
 CACHE_KIB = 32_768
 """Pages that a connection of SQLite keeps if it writes thousands of rows at a time, in KiB."""
 ANALYSED_ROWS = 1000
 """Rows of each index that SQLite's ANALYZE reads."""
+_LONG_OPTION, _BUSY_OPTION = "lagid_is_long", "lagid_busy_seconds"
+"""Options of a transaction: whether it may take long, and how long it waits for locks (s)."""
 _READ_OPTIONS = {"lagid_reads": True, "postgresql_readonly": True}
-_BUSY_OPTION = "lagid_busy_seconds"
 _DATABASE_KEY, _OWNER_KEY = "lagid_database", "lagid_owner"
 
 
@@ -103,7 +105,7 @@ class Database:
         ----------
         busy_seconds : float, optional
             How long to wait for locks of others, `BUSY_SECONDS` at most. By default that time on
-            SQLite, and on PostgreSQL until the locks are released.
+            SQLite, and on PostgreSQL what its connections have as their limit.
         """
         factory = self._write
         if busy_seconds is not None:
@@ -123,15 +125,15 @@ class Database:
     @contextmanager
     def read_snapshot(self) -> Iterator[Connection]:
         """Open a connection that sees one state of the database until the block ends."""
-        options: dict[str, Any] = dict(_READ_OPTIONS)
+        options: dict[str, Any] = {**_READ_OPTIONS, _LONG_OPTION: True}
         if not self.is_sqlite:  # where a reading transaction sees one state in any case
             options["isolation_level"] = "REPEATABLE READ"
         with self.engine.execution_options(**options).begin() as connection:
             yield connection
 
     def get_waiting_engine(self, seconds: float) -> Engine:
-        """Return an engine whose transactions wait `seconds` for locks of others."""
-        return self.engine.execution_options(**{_BUSY_OPTION: seconds})
+        """Return an engine whose transactions wait `seconds` for locks, and may take long."""
+        return self.engine.execution_options(**{_BUSY_OPTION: seconds, _LONG_OPTION: True})
 
     def update_statistics(self) -> None:
         """Count rows for SQLite's planner, by samples of each index; PostgreSQL does it by itself.
@@ -176,6 +178,8 @@ def find_project(session: Session) -> str:
 
 def _create_engine(url: str, *, is_durable: bool, **options: Any) -> Engine:
     address = make_url(url)
+    if options.get("poolclass", QueuePool) is QueuePool:
+        options.setdefault("pool_timeout", POOL_SECONDS)
     if address.get_backend_name() == "sqlite":
         settings = {"timeout": BUSY_SECONDS, "check_same_thread": False}
         engine = create_engine(address, json_serializer=to_json, connect_args=settings, **options)
@@ -188,11 +192,11 @@ def _create_engine(url: str, *, is_durable: bool, **options: Any) -> Engine:
     if address.drivername == "postgresql+psycopg":
         check_extra("postgres", "a database on PostgreSQL")
     # A pooled connection may have died with a restarted server: ask before use.
-    settings = {"connect_timeout": CONNECT_SECONDS}
-    engine = create_engine(
-        address, json_serializer=to_json, pool_pre_ping=True, connect_args=settings, **options
-    )
-    event.listen(engine, "begin", _begin_postgresql)
+    engine = create_engine(address, json_serializer=to_json, pool_pre_ping=True, **options)
+    from service.storage.postgresql import limit_transaction, limit_waits
+
+    limit_waits(engine)
+    event.listen(engine, "begin", partial(_begin_postgresql, limit_transaction))
     return engine
 
 
@@ -254,7 +258,6 @@ def _begin_sqlite(connection: Connection) -> None:
     connection.exec_driver_sql("BEGIN" if reads else "BEGIN IMMEDIATE")
 
 
-def _begin_postgresql(connection: Connection) -> None:
-    busy = connection.get_execution_options().get(_BUSY_OPTION)
-    if busy is not None:
-        connection.exec_driver_sql(f"SET LOCAL lock_timeout = {int(1000 * busy)}")
+def _begin_postgresql(limit: Callable[..., None], connection: Connection) -> None:
+    options = connection.get_execution_options()
+    limit(connection, options.get(_BUSY_OPTION), is_long=options.get(_LONG_OPTION, False))

@@ -9,6 +9,7 @@
     - LeaseLost            a dispatcher writes for a job whose lease it no longer holds
     - InvalidStoreUrl      the address of an object store is of an unknown kind
     - ObjectMissing        the object store has no object of that hash
+    - ObjectDamaged        the bytes of an object are not those that were stored
     - ObjectStoreFailed    the object store did not answer, refused, or is not writable
     - DatabaseNotAtHead    the tables belong to another version of the program
         - DatabaseUnknown  this program does not know that version
@@ -102,6 +103,17 @@ class ObjectMissing(StorageError, LookupError):
 
     def __init__(self, sha256: str) -> None:
         super().__init__(f"the object store has no object {sha256}")
+        self.sha256 = sha256
+
+
+class ObjectDamaged(StorageError):
+    """The bytes of an object are not those that were stored under its name."""
+
+    def __init__(self, sha256: str) -> None:
+        super().__init__(
+            f"the stored object {sha256} is damaged: its checksum is another. Store the same "
+            "recording again, or restore it from a backup"
+        )
         self.sha256 = sha256
 
 

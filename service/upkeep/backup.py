@@ -18,21 +18,23 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from enum import Enum
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy import Connection
+from sqlalchemy.orm import Session
 
 from service.queue.dispatchers import DispatcherRepository
 from service.storage import migrate
 from service.storage.columns import DocumentType, OrderedJsonType, UtcDateTime, utc_now
 from service.storage.garbage import select_hashes
 from service.storage.objects import ObjectStore
-from service.storage.sessions import Database
+from service.storage.sessions import BUSY_SECONDS, Database
 from service.storage.statements import split_chunks
-from service.storage.storage_errors import ObjectMissing, StorageError
+from service.storage.storage_errors import ObjectDamaged, ObjectMissing, StorageError
 from service.storage.tables import Base, DispatcherHeartbeat, WebSession
 
 FORMAT = 1
@@ -76,18 +78,22 @@ class BackupReport:
     objects, object_bytes : int
     missing : tuple of str
         Objects that rows refer to, but that the store did not have.
+    damaged : tuple of str
+        Objects whose checksum was another: they are not restored.
     """
 
     rows: dict[str, int]
     objects: int
     object_bytes: int
     missing: tuple[str, ...] = ()
+    damaged: tuple[str, ...] = ()
 
 
 def write_backup(database: Database, store: ObjectStore, path: Path) -> BackupReport:
     """Write all rows and objects into a file that only this user can read.
 
-    The file appears when it is complete.
+    The file appears when it is complete. Each object is checked. One that is missing or damaged is
+    reported, and all others are written.
 
     Raises
     ------
@@ -116,7 +122,8 @@ def restore_backup(
 ) -> BackupReport:
     """Restore a backup into an empty database and store, and upgrade the tables to this version.
 
-    Everything is checked before the first row is written. All rows are one transaction.
+    All tables are checked before the first row is written. All rows are one transaction. Objects
+    that are damaged in the file are left out and reported.
 
     Parameters
     ----------
@@ -137,13 +144,13 @@ def restore_backup(
             for name, table in manifest["tables"].items():
                 _check_table(archive, path, name, table)
             _check_target(database, store, force)
-            objects, size = _restore_objects(archive, path, store)
+            objects, size, damaged = _restore_objects(archive, store)
             _restore_rows(archive, database, manifest)
     except (zipfile.BadZipFile, zipfile.LargeZipFile, EOFError) as error:
         raise InvalidBackup(path, f"it is no complete ZIP archive ({error})") from None
     migrate.upgrade_database(database)
     rows = {name: table["rows"] for name, table in manifest["tables"].items()}
-    return BackupReport(rows, objects, size, tuple(manifest["missing"]))
+    return BackupReport(rows, objects, size, tuple(manifest["missing"]), damaged)
 
 
 def _write_content(
@@ -159,12 +166,15 @@ def _write_content(
         hashes = sorted(
             {str(row[0]) for query in select_hashes() for row in connection.execute(query)}
         )
-    size, missing = 0, []
+    size, missing, damaged = 0, list[str](), list[str]()
     for sha256 in hashes:
         try:
             size += _write_object(archive, store, sha256)
         except ObjectMissing:
             missing.append(sha256)
+        except ObjectDamaged:
+            damaged.append(sha256)
+    n_objects = len(hashes) - len(missing) - len(damaged)
     manifest = {
         "format": FORMAT,
         "version": version("lagid"),
@@ -172,12 +182,12 @@ def _write_content(
         "taken_at": taken_at.isoformat(),
         "database": "sqlite" if database.is_sqlite else "postgresql",
         "tables": tables,
-        "objects": len(hashes) - len(missing),
+        "objects": n_objects,
         "missing": missing,
     }
     archive.writestr(MANIFEST, json.dumps(manifest, indent=1))
     rows = {name: table["rows"] for name, table in tables.items()}
-    return BackupReport(rows, len(hashes) - len(missing), size, tuple(missing))
+    return BackupReport(rows, n_objects, size, tuple(missing), tuple(damaged))
 
 
 def _write_table(
@@ -281,6 +291,11 @@ def _check_target(database: Database, store: ObjectStore, force: bool) -> None:
                     f"the dispatcher {alive[0]} works on this database; stop all processes of "
                     "lagid first"
                 )
+            if others := _list_other_processes(database, session):
+                raise TargetInUse(
+                    f"another process ({others[0]}) uses this database; stop all processes of "
+                    "lagid first"
+                )
             filled = [
                 table.name
                 for table in Base.metadata.sorted_tables
@@ -300,18 +315,33 @@ def _check_target(database: Database, store: ObjectStore, force: bool) -> None:
         )
 
 
-def _restore_objects(archive: zipfile.ZipFile, path: Path, store: ObjectStore) -> tuple[int, int]:
-    n_objects, size = 0, 0
+def _list_other_processes(database: Database, session: Session) -> list[str]:
+    """List who else uses a database of PostgreSQL; that of a file is locked by its folder."""
+    if database.is_sqlite:
+        return []
+    from service.storage.postgresql import list_other_processes  # its driver may be absent
+
+    return list_other_processes(session)
+
+
+def _restore_objects(
+    archive: zipfile.ZipFile, store: ObjectStore
+) -> tuple[int, int, tuple[str, ...]]:
+    """Store the objects; return their number and bytes, and the names of damaged ones."""
+    n_objects, size, damaged = 0, 0, []
     for entry in archive.infolist():
         folder, _, sha256 = entry.filename.partition("/")
         if folder != "objects":
             continue
-        with archive.open(entry) as member:
-            stored = store.put_stream(iter(lambda: member.read(_BLOCK), b""))
-        if stored.sha256 != sha256:
-            raise InvalidBackup(path, f"its object {sha256} is damaged: the checksum is another")
+        try:
+            with archive.open(entry) as member:
+                blocks = iter(partial(member.read, _BLOCK), b"")
+                stored = store.put_stream(blocks, expected=sha256)
+        except (ObjectDamaged, zipfile.BadZipFile, EOFError):
+            damaged.append(sha256)
+            continue
         n_objects, size = n_objects + 1, size + stored.size
-    return n_objects, size
+    return n_objects, size, tuple(damaged)
 
 
 def _restore_rows(
@@ -324,7 +354,7 @@ def _restore_rows(
         current = None
     if current is None:
         migrate.upgrade_database(database, revision)
-    with database.engine.begin() as connection:
+    with database.get_waiting_engine(BUSY_SECONDS).begin() as connection:
         existing = set(sa.inspect(connection).get_table_names())
         for table in reversed(Base.metadata.sorted_tables):
             if table.name in existing:

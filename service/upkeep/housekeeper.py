@@ -1,4 +1,4 @@
-"""Housekeeping of the web process: retention, removal of deleted rows, and of their objects."""
+"""Housekeeping of the web process: retention, removal of deleted rows and objects, scrubbing."""
 
 import logging
 import threading
@@ -16,6 +16,7 @@ from service.upkeep.retention import (
     delete_expired_jobs,
     purge_deleted_jobs,
 )
+from service.upkeep.scrubber import Scrubber
 
 _log = logging.getLogger(__name__)
 
@@ -51,8 +52,10 @@ class Housekeeper:
         store: ObjectStore,
         keep: KeptDays,
         stopping: threading.Event,
+        scrubber: Scrubber,
     ) -> None:
         self._database, self._store, self._keep = database, store, keep
+        self._scrubber = scrubber
         self._stopping = stopping
         self._collected_at = time.monotonic()
         self._thread = threading.Thread(target=self._run_loop, name="housekeeper", daemon=True)
@@ -66,7 +69,10 @@ class Housekeeper:
         self._thread.join(5.0)
 
     def run_pass(self) -> None:
-        """Delete what has expired, remove the rows of deleted jobs, and then their objects."""
+        """Delete what has expired, remove the rows of deleted jobs, and then their objects.
+
+        At the end some of the other objects are read, to find damage.
+        """
         deleted = delete_expired_jobs(self._database, self._keep.jobs)
         if deleted:
             _log.info("retention deleted %s", ", ".join(deleted))
@@ -80,6 +86,7 @@ class Housekeeper:
             if n_objects:
                 _log.info("removed %d objects, %d bytes", n_objects, n_bytes)
             self._collected_at = time.monotonic()
+        self._scrubber.read_due(self._stopping)
 
     def _run_loop(self) -> None:
         pause = FIRST_PAUSE_SECONDS

@@ -1,5 +1,7 @@
 """Backups hold every row and object, and are restored bit for bit: both databases, both stores."""
 
+import subprocess
+import sys
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
@@ -213,6 +215,33 @@ def test_a_place_with_rows_or_objects_is_refused_without_force(
         restore_backup(target, other, file, force=True)
 
 
+@pytest.mark.postgres
+def test_a_database_that_another_process_uses_is_not_restored_into(
+    sqlite_database: Database, tmp_path: Path
+) -> None:
+    store = open_store(f"file://{tmp_path}/objects")
+    write_backup(sqlite_database, store, tmp_path / "b.zip")
+    code = "\n".join(
+        (
+            "import sys; from service.storage.sessions import Database",
+            "database = Database(sys.argv[1])",
+            "with database.engine.connect(): print('ready', flush=True); sys.stdin.read()",
+        )
+    )
+    with empty_postgres() as target:
+        migrate.upgrade_database(target)
+        url = target.engine.url.render_as_string(hide_password=False)
+        with subprocess.Popen(
+            [sys.executable, "-c", code, url], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        ) as other:
+            assert other.stdout is not None
+            assert other.stdout.readline() == b"ready\n"
+            with pytest.raises(TargetInUse, match=f"another process .lagid {other.pid} of"):
+                restore_backup(target, store, tmp_path / "b.zip", force=True)
+            other.communicate(b"")
+        restore_backup(target, store, tmp_path / "b.zip", force=True)
+
+
 def test_a_backup_of_an_earlier_revision_is_upgraded(
     database_with_rows: Database,
     store: ObjectStore,
@@ -255,24 +284,64 @@ def damage(file: Path, name: str, content: bytes | None) -> None:
         ),
         ("tables/jobs.jsonl", b"[]\n", "table jobs is damaged"),
         ("tables/jobs.jsonl", None, "no table jobs"),
-        ("object", b"other", "object .* is damaged"),
     ],
 )
 def test_a_damaged_backup_is_refused_and_changes_no_row(
     sqlite_database: Database, tmp_path: Path, name: str, content: bytes | None, reason: str
 ) -> None:
     source = open_store(f"file://{tmp_path}/objects")
-    sha256 = source.put_stream([b"data"]).sha256
-    add_dataset(sqlite_database, sha256=sha256)
+    add_dataset(sqlite_database, sha256=source.put_stream([b"data"]).sha256)
     file = tmp_path / "b.zip"
     write_backup(sqlite_database, source, file)
-    damage(file, f"objects/{sha256}" if name == "object" else name, content)
+    damage(file, name, content)
     place = tmp_path / "place"
     place.mkdir()
     with empty_sqlite(place) as restored:
         with pytest.raises(InvalidBackup, match=reason):
             restore_backup(restored, open_store(f"file://{place}/objects"), file)
         assert migrate.read_current_revision(restored) is None
+
+
+@pytest.mark.parametrize("where", ["member", "bit"])
+def test_what_is_whole_of_a_backup_with_a_damaged_object_is_restored(
+    sqlite_database: Database, tmp_path: Path, where: str
+) -> None:
+    source, file = open_store(f"file://{tmp_path}/objects"), tmp_path / "b.zip"
+    bad, good = (source.put_stream([text * 50]).sha256 for text in (b"bad", b"good"))
+    for sha256 in (bad, good):
+        add_dataset(sqlite_database, sha256=sha256, source_key=sha256)
+    write_backup(sqlite_database, source, file)
+    if where == "member":
+        damage(file, f"objects/{bad}", b"other")
+    else:
+        file.write_bytes(file.read_bytes().replace(b"badbadbad", b"badbbdbad", 1))
+    place = tmp_path / "place"
+    place.mkdir()
+    with empty_sqlite(place) as restored:
+        target = open_store(f"file://{place}/objects")
+        report = restore_backup(restored, target, file)
+        assert (report.objects, report.damaged) == (1, (bad,))
+        assert read_rows(restored) == read_rows(sqlite_database)
+        assert read_objects(target) == {good: b"good" * 50}
+
+
+def test_a_backup_has_all_but_the_damaged_objects_and_names_these(
+    sqlite_database: Database, tmp_path: Path
+) -> None:
+    source, file = open_store(f"file://{tmp_path}/objects"), tmp_path / "b.zip"
+    bad, good = (source.put_stream([text * 50]).sha256 for text in (b"bad", b"good"))
+    for sha256 in (bad, good):
+        add_dataset(sqlite_database, sha256=sha256, source_key=sha256)
+    path = tmp_path / "objects" / "sha256" / bad[:2] / f"{bad}.mcap"
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    report = write_backup(sqlite_database, source, file)
+    assert (report.objects, report.damaged, report.missing) == (1, (bad,), ())
+    place = tmp_path / "place"
+    place.mkdir()
+    with empty_sqlite(place) as restored:
+        target = open_store(f"file://{place}/objects")
+        assert restore_backup(restored, target, file).damaged == (bad,)
+        assert read_objects(target) == {good: b"good" * 50}
 
 
 @pytest.mark.parametrize("size", [0, 10, -1])

@@ -236,3 +236,37 @@ def test_only_a_failed_or_cancelled_job_can_be_resumed(database):
         JobRepository(session).resume(job_id)
     with pytest.raises(RowNotFound), database.write_session() as session:
         JobRepository(session).resume("job_none")
+
+
+def test_the_failed_runs_of_a_job_that_ended_are_resumed_alone(database):
+    got, (done, bad, late) = submit_and_claim(database, n_runs=3)
+    with database.write_session() as session:
+        RunWriter(session, got.lease).record_outcomes(
+            [
+                RunOutcome(run_id=done, state=JobState.SUCCEEDED, best_rms=0.1),
+                RunOutcome(run_id=bad, state=JobState.FAILED, error="the store was away"),
+                RunOutcome(run_id=late, state=JobState.SUCCEEDED, best_rms=0.2),
+            ]
+        )
+    with pytest.raises(RowConflict, match="by itself"), database.write_session() as session:
+        JobRepository(session).resume(got.job.id, only_failed=True)
+    with database.write_session() as session:
+        LeaseQueue(session).finish_job(got.lease, JobState.SUCCEEDED, "1 of 3 runs failed")
+    with pytest.raises(RowConflict, match="failed=true"), database.write_session() as session:
+        JobRepository(session).resume(got.job.id)
+    with database.write_session() as session:
+        job = JobRepository(session).resume(got.job.id, only_failed=True)
+        assert (job.state, job.n_done, job.n_failed, job.error) == (JobState.QUEUED, 2, 0, None)
+    runs = {run.id: run.state for run in runs_of(database, got.job.id)}
+    assert runs == {
+        done: JobState.SUCCEEDED,
+        bad: JobState.QUEUED,
+        late: JobState.SUCCEEDED,
+    }
+    again = claim(database)
+    with database.write_session() as session:
+        success = RunOutcome(run_id=bad, state=JobState.SUCCEEDED, best_rms=0.3)
+        RunWriter(session, again.lease).record_outcomes([success])
+        LeaseQueue(session).finish_job(again.lease, JobState.SUCCEEDED, None)
+    with pytest.raises(RowConflict, match="no run of"), database.write_session() as session:
+        JobRepository(session).resume(got.job.id, only_failed=True)

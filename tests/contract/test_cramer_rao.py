@@ -7,13 +7,18 @@ import numpy as np
 import pytest
 
 from service.core.states import OPEN_STATES, JobState
-from service.dispatch import run_cramer_rao
+from service.datasets import stored_recordings
+from service.dispatch import job_parts, run_cramer_rao
 from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.held_leases import HeldLeases
+from service.repositories.event_rows import EventRepository
+from service.repositories.job_rows import JobRepository
+from service.storage.storage_errors import ObjectStoreFailed
 from service.sweeps.group_cramer_rao import StoredBounds
 from sysid.uncertainty.cramer_rao import cramer_rao_bound
 from tests.support.cluster.inline_executor import InlineExecutor
 from tests.support.limits import LIMIT_SECONDS
+from tests.support.storage.job_rows import new_job
 
 pytestmark = pytest.mark.slow
 
@@ -115,3 +120,54 @@ def test_of_more_problems_than_bounds_are_computed_of_a_note_tells(place, monkey
 
 
 SKIPS = [{"path": "/skip", "values": [1, 2]}, {"path": "/skip", "values": [1, 2, 3]}]
+
+
+def test_bounds_and_runs_wait_for_a_store_that_is_away(place, monkeypatch):
+    monkeypatch.setattr(job_parts, "RETRY_SECONDS", 0.0)
+    monkeypatch.setattr(run_cramer_rao, "RETRY_SECONDS", 0.0)
+    read, n_refused = place.store.get_bytes, [0]
+
+    def refuse(sha256):
+        n_refused[0] += 1
+        if n_refused[0] % 4:
+            raise ObjectStoreFailed("the object store cannot read an object: 500")
+        return read(sha256)
+
+    monkeypatch.setattr(place.store, "get_bytes", refuse)
+    monkeypatch.setattr(stored_recordings, "CACHE_SIZE", 0)
+    empty = stored_recordings._RecordingCache()
+    monkeypatch.setattr(stored_recordings, "_recording_cache", empty)
+    monkeypatch.setattr(job_parts, "CACHED_SAMPLES", 0)
+    (job,) = carry_out_jobs(place, place.submit(**NOISY))
+    assert job.state is JobState.SUCCEEDED
+    assert job.cramer_rao["problems"][0]["stderr"]["T"] > 0
+    with place.database.read_session() as session:
+        told = [one.data for one in EventRepository(session).list_after(job.id)]
+    assert "wait for their recordings" in str(told)
+
+
+def test_a_dispatcher_goes_on_while_recordings_are_read(place, monkeypatch):
+    monkeypatch.setattr(job_parts, "LOAD_SECONDS", 0.05)
+    monkeypatch.setattr(job_parts, "ASK_SECONDS", 0.0)
+    empty = stored_recordings._RecordingCache()
+    monkeypatch.setattr(stored_recordings, "_recording_cache", empty)
+    may_go_on, read = threading.Event(), place.store.get_bytes
+
+    def hang(sha256):
+        assert may_go_on.wait(LIMIT_SECONDS)
+        return read(sha256)
+
+    slow = place.submit(algorithm=SMALL)
+    monkeypatch.setattr(place.store, "get_bytes", hang)
+
+    def meanwhile():
+        place.until(slow, JobState.RUNNING)
+        with place.database.write_session() as session:
+            other = JobRepository(session).submit(new_job("other", place.job(slow).spec)).job.id
+            JobRepository(session).cancel(slow)
+        place.until(slow, JobState.CANCELLED)  # the main loop has seen it
+        may_go_on.set()
+        place.until(other, JobState.SUCCEEDED)
+
+    (job,) = carry_out_jobs(place, slow, meanwhile=meanwhile)
+    assert job.state is JobState.CANCELLED

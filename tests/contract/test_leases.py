@@ -1,5 +1,7 @@
 """A dispatcher's leases and what it does when one is late or lost; the clock is the test's."""
 
+import re
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +15,7 @@ from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.held_leases import HeldLeases
 from service.queue.dispatchers import DispatcherRepository
 from service.storage.tables import Parcel
-from tests.support.cluster.dispatch_place import Place
+from tests.support.cluster.dispatch_place import Place, until
 from tests.support.storage.job_rows import Clock, claim, job_of, state_of, submit
 from tests.unit.workers.test_scheduler import ScriptedExecutor, fails
 
@@ -270,6 +272,34 @@ def test_a_heartbeat_waits_for_the_database_no_longer_than_a_third_of_the_lease(
     assert slow.waits == [1.0]
     leases.renew_leases()
     assert leases.is_held(lease)
+
+
+def test_no_heartbeat_is_sent_while_the_main_loop_stands(
+    database, caplog: pytest.LogCaptureFixture
+) -> None:
+    claimed = HeldLeases(database, 0.6)
+
+    def has_news() -> bool:
+        with database.read_session() as session:
+            (row,) = DispatcherRepository(session).list_all()
+        is_new, seen["at"] = row.seen_at != seen.get("at"), row.seen_at
+        return is_new
+
+    seen: dict[str, object] = {}
+    claimed.loop.turn()
+    claimed.start_heartbeat({})
+    until(lambda: "stands" in caplog.text, "the log")
+    has_news()
+    time.sleep(0.6)
+    assert not has_news()
+    with database.read_session() as session:
+        told = DispatcherRepository(session).describe_wait()
+    assert re.match(f"no dispatcher is alive: the last heartbeat of {claimed.owner} is", told or "")
+    claimed.loop.turn()
+    claimed.loop.end()  # it needs none any more
+    until(has_news, "a heartbeat")
+    assert "the main loop turns again" in caplog.text
+    claimed.stop_heartbeat()
 
 
 def test_of_two_dispatchers_the_one_that_stops_is_removed(database, clock: Clock) -> None:

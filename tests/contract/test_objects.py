@@ -12,7 +12,12 @@ import pytest
 
 from service.storage import objects
 from service.storage.objects import open_store
-from service.storage.storage_errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
+from service.storage.storage_errors import (
+    InvalidStoreUrl,
+    ObjectDamaged,
+    ObjectMissing,
+    ObjectStoreFailed,
+)
 from tests.support.storage.object_stores import open_s3_client
 
 FUTURE = datetime.now(UTC) + timedelta(days=1)
@@ -141,25 +146,66 @@ def test_a_large_object_goes_to_a_bucket_in_parts(bucket, monkeypatch):
         assert store.get_bytes(store.put_stream([data]).sha256) == data
 
 
-def test_a_bucket_never_replaces_an_object(bucket):
+def test_a_bucket_replaces_no_object_that_is_whole_and_heals_a_damaged_one(bucket, monkeypatch):
     store = open_store(bucket)
     name = store.put_stream([b"first"]).sha256
+    sent, put = [], obstore.put
+
+    def count_and_put(*given, **options):
+        sent.append(given)
+        return put(*given, **options)
+
+    monkeypatch.setattr(obstore, "put", count_and_put)
+    store.put_stream([b"first"])
+    assert len(sent) == 1  # the one that creates, and is refused
     client = open_s3_client()
     key = f"lagid/sha256/{name[:2]}/{name}.mcap"
-    client.put_object(Bucket=bucket.split("/")[2], Key=key, Body=b"marked")
+    client.put_object(Bucket=bucket.split("/")[2], Key=key, Body=b"damage")
     client.close()
     store.put_stream([b"first"])
-    assert store.get_bytes(name) == b"marked"
+    assert store.get_bytes(name) == b"first"
 
 
-def test_a_folder_never_replaces_an_object_and_has_the_agreed_layout(tmp_path):
+def test_a_folder_replaces_no_object_that_is_whole_and_has_the_agreed_layout(tmp_path):
     store = open_store(f"file://{tmp_path}")
     name = store.put_stream([b"first"]).sha256
     path = tmp_path / "sha256" / name[:2] / f"{name}.mcap"
-    path.write_bytes(b"marked")
+    before = path.stat().st_ino
     store.put_stream([b"first"])
-    assert path.read_bytes() == b"marked"
+    assert path.stat().st_ino == before
     assert list((tmp_path / "tmp").iterdir()) == []
+
+
+DAMAGE = [b"fir\x73u", b"firs", b"", b"first and more"]
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_object_is_told_and_healed_by_its_own_bytes(tmp_path, damage, monkeypatch):
+    monkeypatch.setattr(objects, "_BLOCK", 3)
+    store = open_store(f"file://{tmp_path}")
+    name = store.put_stream([b"first"]).sha256
+    path = tmp_path / "sha256" / name[:2] / f"{name}.mcap"
+    path.write_bytes(damage)
+    for read in (store.get_bytes, store.check_object, lambda one: list(store.get_stream(one))):
+        with pytest.raises(ObjectDamaged, match=name):
+            read(name)
+    with pytest.raises(ObjectDamaged):
+        store.put_stream([b"other"], expected=name)
+    assert [one.sha256 for one in store.list_objects()] == [name]
+    store.put_stream([b"first"])
+    assert store.get_bytes(name) == b"first"
+    assert list((tmp_path / "tmp").iterdir()) == []
+
+
+def test_the_last_block_of_a_damaged_object_is_not_sent(store, tmp_path, monkeypatch):
+    monkeypatch.setattr(objects, "_BLOCK", 4)
+    name = store.put_stream([b"0123456789"]).sha256
+    monkeypatch.setattr(store, "_read_range", lambda sha256, start, length: b"x" * length)
+    got = []
+    with pytest.raises(ObjectDamaged):
+        got.extend(store.get_stream(name))
+    assert b"".join(got) == b"x" * 8
+    assert b"".join(store.get_stream(name, 1, 3)) == b"xxx"  # a part has no checksum
 
 
 def test_a_folder_forgets_what_a_crash_left_half_written_long_ago(tmp_path):

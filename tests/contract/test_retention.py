@@ -36,6 +36,7 @@ from service.upkeep.retention import (
     delete_expired_jobs,
     purge_deleted_jobs,
 )
+from service.upkeep.scrubber import Scrubber
 from tests.contract.test_items import add_dataset, add_job, end_job
 from tests.support.storage.job_rows import runs_of
 
@@ -180,7 +181,7 @@ def test_the_housekeeper_frees_objects_of_what_was_deleted(
     job, _ = end_job(database, DONE, dataset=data)
     age(database, Job, job, 40)
     age(database, Dataset, data, 40)
-    keeper = Housekeeper(database, store, KeptDays(jobs=30), threading.Event())
+    keeper = Housekeeper(database, store, KeptDays(jobs=30), threading.Event(), Scrubber(store, 0))
     keeper.run_pass()
     assert store.exists(raw)  # a backup may be reading it
     monkeypatch.setattr(housekeeper, "COLLECT_SECONDS", -1.0)
@@ -209,10 +210,12 @@ def test_audit_entries_are_deleted_once_their_days_have_passed(
         for entry in list_actions(session).items[2:]:
             entry.at = utc_now() - timedelta(days=31)
     store = open_store(f"file://{tmp_path}/objects")
-    Housekeeper(database, store, KeptDays(), threading.Event()).run_pass()
+    Housekeeper(database, store, KeptDays(), threading.Event(), Scrubber(store, 0)).run_pass()
     assert len(list_numbers()) == 6
     monkeypatch.setattr(retention, "ROWS_AT_ONCE", 2)
-    Housekeeper(database, store, KeptDays(audit=30), threading.Event()).run_pass()
+    Housekeeper(
+        database, store, KeptDays(audit=30), threading.Event(), Scrubber(store, 0)
+    ).run_pass()
     assert list_numbers() == ["key_5", "key_4"]
     assert delete_expired_actions(database, 30) == 0
 

@@ -78,9 +78,13 @@ def test_no_text_of_a_user_is_a_formula_in_a_spreadsheet(database: Database) -> 
     cells = [new_run(number=0), new_run(number=1)]
     job = end_job_with(database, cells, {0: EVIL, 1: "-2"})
     assert [one["error"] for one in list_rows(database, job)] == [f"'{EVIL}", "-2"]
-    for text in ("+1+cmd|' /C calc'!A0", "-2*K", "@SUM(1)", "\t=1", "\r=1", "\n=1", "\uff1d1"):
+    for text in ("+1+cmd|' /C calc'!A0", "-2*K", "@SUM(1)", "\t=1", "\r=1", " =1", "\uff1d1"):
         [row] = list_rows(database, end_job_with(database, [new_run(number=0)], {0: text}))
         assert row["error"] == f"'{text}".replace("\r", " ")
+    # Where `;` separates, what is behind it is a cell of its own, and so is another line.
+    for text, escaped in ((";=1", ";'=1"), ('a; "=1', "a;' \"=1"), ("\n=1", "'\n'=1")):
+        [row] = list_rows(database, end_job_with(database, [new_run(number=0)], {0: text}))
+        assert row["error"] == escaped
 
 
 def add_estimates(database: Database, job: str, told: Sequence[tuple[str, str, str]]) -> None:

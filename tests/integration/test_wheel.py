@@ -346,3 +346,38 @@ def test_the_wheel_identifies_serves_and_runs_a_job(
     values = {parameter["name"]: parameter["value"] for parameter in run["parameters"]}
     assert values == {parameter["name"]: parameter["value"] for parameter in found["parameters"]}
     assert "Plotly" in (here.folder / "report.html").read_text()
+
+
+def test_the_wheel_of_the_image_serves_its_guides_and_makes_its_tables(
+    image_wheel: Path, tmp_path: Path
+) -> None:
+    """In an environment of its own, beside the libraries that are installed here."""
+    environment = tmp_path / "environment"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
+    (own,) = environment.glob("lib/*/site-packages")
+    with ZipFile(image_wheel) as archive:
+        archive.extractall(own)
+    libraries = Path(pytest.__file__).parents[1]
+    (own / "libraries.pth").write_text(f"{libraries}\n")
+    code = f"""
+import sys
+import lagid, migrations, service.guides
+assert all(one.__path__[0].startswith({str(own)!r}) for one in (lagid, migrations, service.guides))
+sys.argv = ["lagid", *sys.argv[1:]]
+lagid.main()
+"""
+
+    def run(*words: object) -> "subprocess.CompletedProcess[str]":
+        return subprocess.run(
+            [environment / "bin" / "python", "-P", "-c", code, *map(str, words)],
+            cwd=tmp_path,
+            env={"PATH": os.environ["PATH"]},
+            capture_output=True,
+            text=True,
+            timeout=LIMIT_SECONDS,
+            check=False,
+        )
+
+    made = run("db", "upgrade", "--data-dir", tmp_path / "data")
+    assert "revision" in made.stdout, made.stderr
+    assert run("db", "check", "--data-dir", tmp_path / "data").returncode == 0

@@ -46,6 +46,7 @@ _SERVICE = {
         "networks": _STRINGS,
         "shm_size": {"type": "string", "pattern": r"^\d+(mb|gb)$"},
         "stop_grace_period": _SECONDS,
+        "ulimits": {"type": "object", "additionalProperties": {"type": "integer"}},
         "deploy": {
             "type": "object",
             "additionalProperties": False,
@@ -221,6 +222,17 @@ def test_the_proxy_passes_on_large_recordings_events_and_host() -> None:
     assert text.count("{") == text.count("}")
 
 
+def test_the_proxy_believes_nothing_that_clients_say_of_themselves() -> None:
+    text = (DOCKER / "nginx.conf").read_text()
+    set_here = dict(re.findall(r"proxy_set_header (\S+) (\S+);", text))
+    user = Settings.model_fields["proxy_header"].default
+    assert set_here[user] == set_here["Forwarded"] == set_here["X-Forwarded-Host"] == '""'
+    assert (set_here["X-Forwarded-For"], set_here["X-Forwarded-Proto"]) == (
+        "$remote_addr",
+        "$scheme",
+    )
+
+
 def test_every_setting_named_in_the_compose_file_exists_and_no_secret_has_a_default() -> None:
     text = (DOCKER / "compose.yaml").read_text()
     known = {f"LAGID_{name.upper()}" for name in Settings.model_fields}
@@ -287,6 +299,22 @@ def test_whatever_a_pod_mounts_is_declared_and_runs_as_the_user_of_the_image() -
 def test_kubernetes_is_told_the_version_of_ray_that_is_locked() -> None:
     locked = re.findall(r"^ray==([\d.]+)", (ROOT / "requirements.lock").read_text(), re.MULTILINE)
     assert [one["spec"]["rayVersion"] for one in _kubernetes("RayCluster")] == locked
+
+
+def test_the_web_processes_of_two_versions_never_serve_at_once_and_their_memory_suffices() -> None:
+    (deployment,) = _kubernetes("Deployment")
+    assert deployment["spec"]["strategy"] == {"type": "Recreate"}
+    (web,) = deployment["spec"]["template"]["spec"]["containers"]
+    (n_uploads,) = [one["value"] for one in web["env"] if one["name"] == "LAGID_MAX_UPLOADS"]
+    limit = int(web["resources"]["limits"]["memory"].removesuffix("Gi"))
+    assert limit >= 4 * int(n_uploads) + 1
+
+
+def test_our_containers_may_open_many_connections_and_are_started_again() -> None:
+    services = _compose()["services"]
+    for name in OURS:
+        assert services[name]["ulimits"]["nofile"] >= 65_536
+        assert services[name]["restart"] == "unless-stopped"
 
 
 def test_every_container_of_kubernetes_has_probes_for_its_start_and_its_life() -> None:

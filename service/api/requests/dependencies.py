@@ -17,6 +17,7 @@ from service.api.store_probe import StoreProbe
 from service.core.settings import Settings
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database, SessionOwner
+from service.upkeep.scrubber import Scrubber
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class Parts:
         The events of all jobs that have a stream.
     probe : StoreProbe
         Tells whether objects can be written.
+    scrubber : Scrubber
+        Reads the stored objects now and then.
     failures : FailureDelay
         Delays the answers to wrong keys.
     """
@@ -46,6 +49,7 @@ class Parts:
     upload_places: asyncio.Semaphore
     feed: EventFeed
     probe: StoreProbe
+    scrubber: Scrubber
     failures: FailureDelay = field(default_factory=FailureDelay)
 
     @classmethod
@@ -54,7 +58,8 @@ class Parts:
         stopping = Event()
         feed = EventFeed(database, stopping, settings.poll_seconds, settings.max_streams)
         places = asyncio.Semaphore(settings.max_uploads)
-        return cls(settings, database, store, stopping, places, feed, StoreProbe(store))
+        scrubber = Scrubber(store, settings.scrub_days)
+        return cls(settings, database, store, stopping, places, feed, StoreProbe(store), scrubber)
 
     def open_for(self, owner: SessionOwner) -> "Parts":
         """Return the same parts for requests of an owner."""

@@ -107,9 +107,19 @@ class OriginCheck:
                 )
 
     def _is_own_origin(self, origin: str, hosts: list[str]) -> bool:
-        authority = origin.lower().partition("://")[2]
-        is_same = authority != "" and authority in map(str.lower, hosts)
-        return is_same or _parse_name(authority) in self._settings.allowed_hosts
+        """Test whether a page is the service's own: other ports of its host are not.
+
+        A proxy may have written another name into `Host`. Then the allowed names are its own, at
+        the usual port.
+        """
+        scheme, _, authority = origin.lower().partition("://")
+        usual_port = ":443" if scheme == "https" else ":80"
+        own = {host.strip().lower().removesuffix(usual_port) for host in hosts}
+        if authority != "" and authority in own:
+            return True
+        name = _parse_name(authority)
+        is_renamed = authority == name and name not in map(_parse_name, hosts)
+        return is_renamed and name in self._settings.allowed_hosts
 
 
 def _parse_name(authority: str) -> str:

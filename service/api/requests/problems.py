@@ -18,6 +18,7 @@ from service.core.bodies.text_checks import LONE_SURROGATE
 from service.core.bodies.validation import describe_error, explain_errors, find_body_type
 from service.core.errors import (
     Conflict,
+    DamagedObject,
     FieldError,
     InvalidRequest,
     InvalidUpload,
@@ -27,10 +28,11 @@ from service.core.errors import (
     UnsupportedMediaType,
     to_field_errors,
 )
+from service.core.process import service_metrics
 from service.core.process.temporary_files import FULL_DISK_ERRORS, FULL_DISK_MESSAGE
 from service.core.root_path import to_address
 from service.storage.retry import TRANSIENT_ERRORS, is_transient
-from service.storage.storage_errors import InvalidCursor, StorageError
+from service.storage.storage_errors import InvalidCursor, ObjectDamaged, StorageError
 from sysid.core.errors import SysidError, UnreadableFile
 
 log = logging.getLogger(__name__)
@@ -160,6 +162,8 @@ def _handle_storage_error(request: Request, error: Exception) -> Response:
         return error_response(request, Unavailable(str(error)))
     if isinstance(error, InvalidCursor):
         return error_response(request, InvalidRequest.from_fault("?cursor", str(error)))
+    if isinstance(error, ObjectDamaged):
+        return error_response(request, DamagedObject(str(error)))
     kind, title = STORAGE_KINDS.get(error.status, ("internal", "The service failed"))
     return problem_response(request, error.status, kind, title, str(error))
 
@@ -169,6 +173,9 @@ def _handle_database_outage(request: Request, error: Exception) -> Response:
         return _handle_unexpected_error(request, error)
     log.error("%s %s: %s", request.method, request.url.path, str(error).splitlines()[0])
     detail = "the database does not answer, or its disk is full. Nothing was changed. Try again."
+    if isinstance(error, SqlTimeout):
+        service_metrics.store_errors.labels("database").inc()
+        detail = "all connections to the database are in use. Nothing was changed. Try again."
     return error_response(request, Unavailable(detail))
 
 

@@ -13,7 +13,7 @@ from service.api.queue_metrics import write_metrics
 from service.api.requests.dependencies import Parts, PartsDep
 from service.core.bodies.wire import Answer
 from service.core.errors import FieldError, Unavailable
-from service.queue.dispatchers import DispatcherRepository, describe_wait
+from service.queue.dispatchers import DispatcherRepository
 from service.storage import migrate
 from service.storage.storage_errors import DatabaseNotAtHead
 
@@ -29,6 +29,9 @@ PROBLEM_KINDS = {
     "unauthorized": "The request has no valid API key. Send `Authorization: Bearer lagid_…`, or "
     "sign in at /sign-in.",
     "conflict": "The current state of the job does not allow this request.",
+    "damaged-object": "Stored bytes of a recording or of signals have another checksum than when "
+    "they were stored. That is the server's damage: its operator restores the object, or you store "
+    "the same recording again.",
     "internal": "An unexpected error occurred. The server's log has the details.",
     "invalid": "The body or a query value is invalid. `errors` lists every fault. "
     "Type errors come first. Once all types are right, the answer lists the other faults.",
@@ -103,7 +106,7 @@ def collect_failures(parts: Parts) -> Iterator[FieldError]:
     try:
         migrate.check_revision(parts.database)
         with parts.database.read_session() as session:
-            wait = describe_wait(DispatcherRepository(session).list_alive())
+            wait = DispatcherRepository(session).describe_wait()
     except SQLAlchemyError:
         yield FieldError("/database", "database: unreachable")
     except DatabaseNotAtHead as error:

@@ -113,11 +113,18 @@ def cancel_job(job_id: str, session: WriteSession) -> JobOut:
 
 
 @router.post("/{job_id}:resume", status_code=status.HTTP_202_ACCEPTED)
-def resume_job(job_id: str, parts: PartsDep, session: WriteSession, response: Response) -> JobOut:
+def resume_job(
+    job_id: str,
+    parts: PartsDep,
+    session: WriteSession,
+    response: Response,
+    failed: Annotated[
+        bool, Query(description="only the failed runs, also of a job that has succeeded")
+    ] = False,
+) -> JobOut:
     """Queue a failed or cancelled job again; it continues from its last checkpoints."""
-    return set_location(
-        submit.to_job_out(submit.resume_job(session, job_id, parts.settings)), response
-    )
+    job = submit.resume_job(session, job_id, parts.settings, only_failed=failed)
+    return set_location(submit.to_job_out(job), response)
 
 
 @router.post("/{job_id}:clone", status_code=status.HTTP_202_ACCEPTED)

@@ -223,7 +223,13 @@ def health_page(parts: PartsDep, caller: CallerDep) -> Response:
     failures = {fault.pointer: fault.detail for fault in collect_failures(parts)}
     is_admin = "admin" in caller.scopes
     return HtmlPage(
-        health_pages.health_page(parts.database, parts.settings, failures, is_admin=is_admin)
+        health_pages.health_page(
+            parts.database,
+            parts.settings,
+            failures,
+            parts.scrubber.describe(),
+            is_admin=is_admin,
+        )
     )
 
 

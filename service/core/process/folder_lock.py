@@ -1,4 +1,4 @@
-"""The lock of a data folder: one `lagid serve` with a dispatcher at a time.
+"""The locks of a data folder: one `lagid serve` with a dispatcher, and who uses it at all.
 
 The system releases it when its process ends, however that happens. So it is never stale.
 """
@@ -12,7 +12,7 @@ from typing import TextIO
 
 from service.core.errors import Misconfigured
 
-_NAME = "serve.lock"
+_NAME, _USE_NAME = "serve.lock", "use.lock"
 _NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 """Errors of a file system without locks, where nothing can be checked."""
 
@@ -52,6 +52,30 @@ def lock_folder(folder: Path, advice: str) -> Iterator[FolderLock]:
         lock = FolderLock(file)
         lock.describe_holder("")
         yield lock
+
+
+@contextmanager
+def use_folder(folder: Path, *, alone: bool = False) -> Iterator[None]:
+    """Use the data of a folder during the block, beside others or `alone`.
+
+    Raises
+    ------
+    Misconfigured
+        If others use them who must not.
+    """
+    kind = fcntl.LOCK_EX if alone else fcntl.LOCK_SH
+    with _open_file(folder.absolute() / _USE_NAME) as file:
+        try:
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
+        except BlockingIOError:
+            text = "`lagid restore` writes to {}; wait until it has ended"
+            if alone:
+                text = "a process of lagid uses {}; stop all of them first"
+            raise Misconfigured(text.format(folder.absolute())) from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+        yield
 
 
 def _open_file(path: Path) -> TextIO:

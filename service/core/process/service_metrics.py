@@ -54,9 +54,23 @@ start_seconds = Gauge(
     "Time in s until this dispatcher was ready.",
 )
 cores = Gauge("lagid_dispatcher_cores", "Cores of the workers of this dispatcher.")
+loop_standing = Gauge(
+    "lagid_dispatcher_standing_seconds",
+    "Time in s for which the main loop of this dispatcher has not turned; it turns often.",
+)
 held_jobs = Gauge("lagid_dispatcher_jobs", "Jobs that this dispatcher holds.")
 store_errors = Counter(
     "lagid_store_errors", "Failed calls to the database or to the object store.", ("store",)
+)
+damaged_objects = Counter(
+    "lagid_damaged_objects", "Reads of stored objects whose checksum was another."
+)
+silent_workers = Counter(
+    "lagid_silent_workers", "Workers that this dispatcher replaced because they did not answer."
+)
+silent_connections = Counter(
+    "lagid_silent_connections",
+    "Connections to PostgreSQL that were replaced because nothing arrived on them.",
 )
 
 for _outcome in ("succeeded", "failed", "reused"):

@@ -224,7 +224,8 @@ def test_the_database_answers_in_json(tmp_path: Path) -> None:
 
     revision = read_answer("upgrade")["revision"]
     assert revision
-    nothing = {"lost": [], "without_row": 0, "deleted": 0, "freed_bytes": 0}
+    nothing = {"database": [], "read": 0, "damaged": [], "lost": []}
+    nothing |= {"without_row": 0, "deleted": 0, "freed_bytes": 0}
     assert read_answer("check") == nothing
     assert read_answer("downgrade", "base", "--yes") == {"revision": "base"}
 

@@ -139,6 +139,7 @@ def test_a_queued_job_is_cancelled_at_once_resumed_and_cloned(
     assert server.post(f"/v1/jobs/{job}:cancel").json()["state"] == "cancelled"
     assert list_events(server, job) == ["state", "state", "end"]
     assert server.post(f"/v1/jobs/{job}:resume").json()["state"] == "queued"
+    read_faults(server.post(f"/v1/jobs/{job}:resume?failed=true"), 409, "conflict")
     twin = server.post(f"/v1/jobs/{job}:clone").json()
     assert twin["id"] != job
     assert server.get(f"/v1/jobs/{twin['id']}").json()["request"]["seed"] == 5

@@ -128,6 +128,27 @@ def test_own_pages_and_programs_are_asked_for_nothing_more(
     assert answer.status_code == 200
 
 
+@pytest.mark.parametrize(
+    ("host", "origin", "is_own"),
+    [
+        ("lagid.example", "https://lagid.example", True),
+        ("lagid.example:443", "https://lagid.example", True),
+        ("lagid.example:8443", "https://lagid.example:8443", True),
+        ("127.0.0.1:8000", "https://lagid.example", True),  # a proxy wrote its own name
+        ("lagid.example", "http://lagid.example:9999", False),
+        ("lagid.example:8443", "https://lagid.example", False),
+        ("127.0.0.1:8000", "http://lagid.example:9999", False),
+    ],
+)
+def test_a_page_of_another_port_of_the_same_host_is_foreign(
+    door: TestClient, host: str, origin: str, is_own: bool
+) -> None:
+    answer = door.post(
+        "/v1/models:check", json={"name": "tank"}, headers={"Host": host, "Origin": origin}
+    )
+    assert answer.status_code == (200 if is_own else 403)
+
+
 @pytest.mark.parametrize("path", ["/v1/models", "/v1/models:check", "/v1/jobs", "/v1/runs:compare"])
 @pytest.mark.parametrize("kind", [None, "text/plain", "application/x-www-form-urlencoded"])
 def test_a_body_without_its_media_type_is_refused(

@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import TimeoutError as NoConnection
 from starlette.testclient import TestClient
 
 from service.api import content
 from service.api.app import create_app
 from service.api.store_probe import PROBE_SECONDS
+from service.core.process import service_metrics
 from service.datasets import datasets
 from service.formats import sandbox
 from service.storage.storage_errors import ObjectStoreFailed
@@ -31,6 +33,21 @@ def test_a_database_that_is_away_is_a_part_that_is_down(
     answer = server.get(path)
     assert read_faults(answer, 503, "unavailable") == []
     assert answer.headers["retry-after"] == "1"
+
+
+def test_a_pool_whose_connections_are_all_in_use_is_told(
+    server: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_args: Any, **_options: Any) -> Any:
+        raise NoConnection("QueuePool limit of size 5 overflow 10 reached")
+
+    count = service_metrics.store_errors.labels("database")._value.get
+    before = count()
+    monkeypatch.setattr(parts_of(server).database, "read_session", refuse)
+    answer = server.get("/v1/jobs")
+    read_faults(answer, 503, "unavailable")
+    assert "all connections to the database are in use" in answer.json()["detail"]
+    assert count() > before
 
 
 def test_readiness_tells_a_stranger_no_address_and_writes_seldom(

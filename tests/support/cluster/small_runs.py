@@ -90,10 +90,17 @@ class Notebook:
         self.results: dict[str, list[Identification]] = {}
         self.failures: dict[str, list[RunFailure]] = {}
         self.kills: dict[str, list[int]] = {}
+        self.told: list[str] = []
         self.is_stopped = False
 
     def record_start(self, run: str) -> None:
         self.begun.append(run)
+
+    def record_silent_worker(self, text: str) -> None:
+        self.told.append(text)
+
+    def record_delay(self, reason: str) -> None:
+        self.told.append(reason)
 
     def record_worker_death(self, run: str, kills: int) -> None:
         self.kills.setdefault(run, []).append(kills)

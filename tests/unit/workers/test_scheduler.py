@@ -18,7 +18,14 @@ from tests.support.cluster.small_runs import (
     spec,
 )
 from workers import packing, scheduler, tasks
-from workers.errors import PackCancelled, PackFailed, PackLost, RecordsUnavailable, WorkerDied
+from workers.errors import (
+    PackCancelled,
+    PackFailed,
+    PackLost,
+    RecordsDelayed,
+    RecordsUnavailable,
+    WorkerDied,
+)
 from workers.job_queue import JobQueue
 from workers.packing import PACKS_PER_CPU
 from workers.protocol import (
@@ -302,6 +309,42 @@ def test_a_run_without_records_fails_with_the_reason() -> None:
     feeder.add_job("a", Empty([QueuedRun("a0", spec())]), notebook)
     assert finish(feeder) == ["a"]
     assert notebook.failures["a0"][0].reason == "there is no dataset ds_1"
+
+
+def test_runs_wait_while_the_store_of_their_records_is_away_and_other_jobs_go_on() -> None:
+    asked: list[str] = []
+
+    class Away(ListedRuns):
+        def load_records(self, key: str) -> Records:
+            asked.append(key)
+            if len(asked) < 5:
+                raise RecordsDelayed("the store is away", 0.0)
+            return super().load_records(key)
+
+    feeder, waiting = Scheduler(ScriptedExecutor(fails)), Notebook()
+    feeder.add_job("a", Away(QueuedRun(f"a{number}", spec()) for number in range(3)), waiting)
+    jobs(feeder, b=1)
+    assert sorted(finish(feeder)) == ["a", "b"]
+    assert waiting.told == ["the store is away"]  # once
+    assert {run: failure.reason for run, (failure,) in waiting.failures.items()} == dict.fromkeys(
+        ("a0", "a1", "a2"), "as told"
+    )
+    assert waiting.begun == ["a0", "a1", "a2"]
+
+
+def test_a_store_that_is_away_is_not_asked_at_every_step() -> None:
+    asked: list[str] = []
+
+    class NeverThere(ListedRuns):
+        def load_records(self, key: str) -> Records:
+            asked.append(key)
+            raise RecordsDelayed("the store is away", 60.0)
+
+    feeder = Scheduler(ScriptedExecutor(fails))
+    feeder.add_job("a", NeverThere([QueuedRun("a0", spec())]), Notebook())
+    for _ in range(20):
+        assert feeder.run_step(0.0) == ()
+    assert len(asked) == 1
 
 
 def test_a_refused_run_fails_with_its_reason_and_the_others_go_on() -> None:

@@ -286,7 +286,13 @@ def test_a_stray_quote_is_told_with_its_row() -> None:
 
 @pytest.mark.parametrize(
     ("name", "written"),
-    [("=1+1", "'=1+1"), ("@SUM(A1)", "'@SUM(A1)"), ("+x", "'+x"), ("x=1", "x=1")],
+    [
+        ("=1+1", "'=1+1"),
+        ("@SUM(A1)", "'@SUM(A1)"),
+        ("+x", "'+x"),
+        ("x=1", "x=1"),
+        ("a;=1+1", "a;'=1+1"),
+    ],
 )
 def test_no_name_or_label_is_a_formula_in_a_spreadsheet_and_each_comes_back(
     name: str, written: str
