@@ -113,7 +113,8 @@ class _Block:
         states = States(lanes, model, experiment, self.arguments["work"], start, scope)
         row = states.fill_history()
         delays = Delays(lanes, model, scope, step)
-        signals = SignalReaders(lanes, model, experiment, states, delays, self.variant.one_step)
+        changes_past = self.variant.one_step or past_reads.corrects_past(model)
+        signals = SignalReaders(lanes, model, experiment, states, delays, changes_past)
         comparison = LossAccumulator(
             lanes, model, self.variant, experiment, self.arguments, self.first
         )
@@ -127,7 +128,7 @@ class _Block:
         build_environment = _bind_environment(lanes, model, scope, states, signals, time_step)
         comparison.compare_step(time_step, states, build_environment)
         loop.leave_if(lanes.builder.icmp_signed(">=", time_step.index, experiment.get_head("last")))
-        if self.variant.one_step:
+        if changes_past:
             states.store_states(time_step.row)
             signals.begin_step(time_step)
         following = self._emit_following_states(time_step, states, build_environment, start)

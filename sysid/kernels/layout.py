@@ -21,12 +21,13 @@ Index of the value at step 0; fine points in a step; begin and end of a step in 
 input jumps, so they differ from 0 and `points`); largest delay in fine points.
 """
 
-OUTPUT_FIELDS = ("measured", "weight", "samples", "fraction", "first", "grid")
+OUTPUT_FIELDS = ("measured", "weight", "samples", "fraction", "first", "grid", "known")
 """Fields of an output.
 
 Indices of measured values and weights; index (in ints) of each grid point's row, or of the bounds
 of its interval's samples; index of the samples' positions in their interval; first row of the
-predictions; index of the measurement interpolated to the grid.
+predictions; index of the measurement interpolated to the grid; index of 1 for each grid point with
+a measured value, else 0 (for corrections only).
 """
 
 FLOAT_FIELDS = ("step", "cap", "scale")

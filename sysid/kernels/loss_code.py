@@ -42,7 +42,7 @@ class LossAccumulator:
     def compare_step(
         self, time_step: TimeStep, states: States, build_environment: EnvironmentBuilder
     ) -> None:
-        """Compare if the step is a grid point; one-step prediction then replaces the states."""
+        """Compare if the step is a grid point; predictions then correct or replace the states."""
         lanes, b = self._lanes, self._lanes.builder
         substeps = self._substeps
         if substeps == 1:
@@ -76,6 +76,9 @@ class LossAccumulator:
         self, grid: IrValue, states: States, build_environment: EnvironmentBuilder
     ) -> None:
         lanes = self._lanes
+        if self._model.corrections:
+            self._correct_states(grid, states, build_environment)
+            return
         scope = build_environment(0, dict(states.now), -1)
         outputs = [
             lanes.splat(emit_expression(lanes, output.expression, scope))
@@ -153,6 +156,35 @@ class LossAccumulator:
         index = b.add(b.mul(row, self._arguments["predictions_stride"]), self._column)
         self._lanes.store_row(value, self._arguments["predictions"], index)
         return []
+
+    def _correct_states(
+        self, grid: IrValue, states: States, build_environment: EnvironmentBuilder
+    ) -> None:
+        """Compare each output in turn, and correct the states by it before the next one.
+
+        So an output is predicted from all samples before it, those of the other outputs at the
+        same time included (Durbin and Koopman, Time Series Analysis by State Space Methods, 2nd
+        ed., ch. 6.4).
+        """
+        lanes, b, experiment = self._lanes, self._lanes.builder, self._experiment
+        for i, output in enumerate(self._model.outputs):
+            scope = build_environment(0, dict(states.now), -1)
+            value = lanes.splat(emit_expression(lanes, output.expression, scope))
+            self._compare_sample(i, grid, value)
+            known, measured = (
+                lanes.load_double(
+                    experiment.floats, b.add(experiment.get_output_field(i, field), grid)
+                )
+                for field in ("known", "measured")
+            )
+            innovation = lanes.sub(measured, value)
+            for one in self._model.corrections:
+                if one.output != output.name:
+                    continue
+                gain, jump = (emit_expression(lanes, tree, scope) for tree in (one.gain, one.jump))
+                change = lanes.add(lanes.mul(gain, innovation), jump)
+                now = states.now[one.state]
+                states.now[one.state] = lanes.splat(lanes.add(now, lanes.mul(known, change)))
 
     def _replace_states(self, grid: IrValue, states: States) -> None:
         """Replace states by measurements, for one-step prediction."""

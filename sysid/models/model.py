@@ -204,6 +204,23 @@ class HistoryFunction:
 
 
 @dataclass(frozen=True, slots=True)
+class Correction:
+    """Change of a state after each sample of an output: + gain·(y - ŷ) + jump.
+
+    Attributes
+    ----------
+    output, state : str
+    gain, jump : Expression
+        Functions of parameters and present states, as they are before the sample.
+    """
+
+    output: str
+    state: str
+    gain: Expression
+    jump: Expression
+
+
+@dataclass(frozen=True, slots=True)
 class Solver:
     """Integration method of a differential model, and reading of past values.
 
@@ -239,7 +256,8 @@ class Model:
     `states`) is the order of computation. `memory` is the largest fixed offset of any past value
     (difference form): the first `memory` samples are measured or initial values. `document` is
     the normal form, from which the model can be built again. `histories` are those of states with a
-    history function, in the states' order.
+    history function, in the states' order. `corrections` are those of a Kalman filter
+    (`sysid.models.kalman_filter`), whose states are not in the document.
 
     `terms` are the terms of a polynomial, in the order of their coefficients. With a `rule` they
     are candidates. `sysid.selection.select.select_model_terms` selects among them on records. Its
@@ -263,6 +281,7 @@ class Model:
     rule: TermRule | None = None
     selection: Selection | None = field(default=None, compare=False)
     histories: tuple[HistoryFunction, ...] = ()
+    corrections: tuple[Correction, ...] = ()
 
     def find_history(self, state: str) -> Expression | None:
         """Find the history function of a state; None if it has none."""

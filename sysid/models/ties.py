@@ -73,6 +73,12 @@ def apply_ties(model: Model, ties: Ties) -> Model:
             replace(history, expression=_substitute_ties(history.expression, ties))
             for history in model.histories
         ),
+        corrections=tuple(
+            replace(
+                one, gain=_substitute_ties(one.gain, ties), jump=_substitute_ties(one.jump, ties)
+            )
+            for one in model.corrections
+        ),
     )
 
 

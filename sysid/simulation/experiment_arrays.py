@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from sysid.core.types import FloatArray, IntArray
+from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.data.interpolation import FineInput, interpolate_input
 from sysid.data.records import Channel
 from sysid.kernels.abi import LANES
@@ -38,6 +38,8 @@ class OutputSamples:
     weights: FloatArray
     grid_values: FloatArray
     """The measurement interpolated to the grid points; empty where it is not needed."""
+    is_known: BoolArray
+    """Whether a value was measured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,6 +183,10 @@ def pack_experiment(
         builder.write_entries(
             "output", i, first=first, grid=builder.add_floats(samples.grid_values)
         )
+        if model.corrections:
+            known = np.zeros(grid.points)
+            known[samples.positions.astype(np.int64)] = samples.is_known
+            builder.write_entries("output", i, known=builder.add_floats(known))
         first += samples.positions.size
     columns = sum(history.columns for history in list_stored_histories(model))
     n_work = max(columns * rows * LANES, 1)

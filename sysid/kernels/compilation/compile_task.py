@@ -10,6 +10,7 @@ from typing import Any
 from sysid.kernels.layout import KernelVariant
 from sysid.language.tree import Binary, FunctionCall, Number, PastValue, Symbol, Unary
 from sysid.models.model import (
+    Correction,
     DerivedInitial,
     EstimatedInitial,
     FixedInitial,
@@ -47,6 +48,7 @@ _TYPES = {
         MeasuredInitial,
         DerivedInitial,
         HistoryFunction,
+        Correction,
         Number,
         Symbol,
         PastValue,

@@ -159,19 +159,27 @@ class ModelTwin:
         grid, found = self.experiment.grid, []
         for m in range(grid.last_step + 1):
             if m % grid.substeps == 0:
-                now = self._now()
-                found.append(
-                    [
-                        self._value(output.expression, m, 0.0, now, -1)
-                        for output in self.model.outputs
-                    ]
-                )
+                found.append([self._compare(i, m) for i in range(len(self.model.outputs))])
                 if self.one_step:
                     self._replace(m // grid.substeps)
             if m < grid.last_step:
                 for name, value in self._next(m).items():
                     self.past[name].append(value)
         return np.array(found).T
+
+    def _compare(self, i: int, m: int) -> float:
+        """An output, whose sample then corrects the states."""
+        now, output = self._now(), self.model.outputs[i]
+        value = self._value(output.expression, m, 0.0, now, -1)
+        samples = self.experiment.outputs[i]
+        places = samples.positions * self.experiment.grid.substeps == m
+        if np.any(samples.is_known & places):
+            innovation = float(samples.values[places][0]) - value
+            for one in self.model.corrections:
+                if one.output == output.name:
+                    gain, jump = (self._value(t, m, 0.0, now, -1) for t in (one.gain, one.jump))
+                    self.past[one.state][-1] += gain * innovation + jump
+        return value
 
     def _now(self) -> dict[str, float]:
         return {name: past[-1] for name, past in self.past.items()}
