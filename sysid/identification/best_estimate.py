@@ -425,7 +425,7 @@ class _EstimateSearch:
         noise, or if the integration step is too long for them (not `is_settled`).
         """
         requested, squares = self.problem.loss.noise_model, GeneralisedEstimate(self.theta, {}, 0)
-        if requested == "white" or not self._refines:
+        if requested not in ("auto", "ar1") or not self._refines:
             return squares._replace(is_complete=requested != "ar1")
         if requested == "ar1":
             return self._use_noise_model()

@@ -1,6 +1,6 @@
 """Conclude a search: refinement, uncertainty, validation, warnings."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from math import inf
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.core.errors import DivergedEverywhere, NothingIdentifiable
 from sysid.core.jit import read_clock
-from sysid.core.settings import GeneticAlgorithm, StartKind
+from sysid.core.settings import FoundNoiseModel, GeneticAlgorithm, StartKind
 from sysid.core.threads import use_one_thread
 from sysid.data.records import find_common_sample_time
 from sysid.identifiability.exchange import describe_exchanges
@@ -279,7 +279,7 @@ def _build_identification(
         degrees=inf if uncertainty is None else uncertainty.degrees,
         noise_sd=None if uncertainty is None else uncertainty.noise_sd,
         noise_colour=None if uncertainty is None else uncertainty.noise_colour,
-        noise_model="ar1" if any(times.values()) else "white",
+        noise_model=_get_noise_model(problem, times),
         correlation_times=times,
         noise_deviations=None
         if problem.settings.weights is not None
@@ -323,6 +323,14 @@ def _get_start(asked: Problem, starts: StartComparison | None) -> StartKind | No
         return starts.own.name
     initial = asked.settings.initial
     return None if initial == "auto" else initial
+
+
+def _get_noise_model(problem: Problem, times: Mapping[str, float]) -> FoundNoiseModel:
+    """Get the noise model of the estimates; ``ar1`` was not taken where no noise is coloured."""
+    asked = problem.loss.noise_model
+    if asked == "plant" or asked == "load":
+        return asked
+    return "ar1" if any(times.values()) else "white"
 
 
 def _compute_input_history(problem: Problem) -> tuple[float, ...]:

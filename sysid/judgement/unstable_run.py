@@ -135,7 +135,7 @@ def find_misled_run(
 
 def _may_mislead(problem: Problem, analysis: Analysis) -> bool:
     """Whether residuals of a free run by squares are not white, and there are other predictions."""
-    is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
+    is_free = problem.is_free_run and problem.loss.kind == "squares"
     uncertainty = analysis.uncertainty
     is_white = uncertainty is None or uncertainty.noise_colour == "white"
     return is_free and not is_white and reads_outputs(problem.model)

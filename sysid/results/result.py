@@ -7,10 +7,9 @@ field of the REST interface, of the client's types and of the saved file.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
 
 from sysid.core.errors import InvalidRecord
-from sysid.core.settings import LossKind, PredictionKind, StartKind
+from sysid.core.settings import FoundNoiseModel, LossKind, PredictionKind, StartKind
 from sysid.core.text import find_rms_unit
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
@@ -138,7 +137,7 @@ class Result:
     noise_colour : NoiseColour or None
         Colour of the residuals that the errors assume. If they drift over the whole record, the
         errors are lower bounds.
-    noise_model : {"white", "ar1"}
+    noise_model : {"white", "ar1", "plant", "load"}
         Noise model of the estimates.
     correlation_times : mapping of str to float
         Correlation time of each output's noise, s, where the noise model has one.
@@ -194,7 +193,7 @@ class Result:
     correlation: CorrelationMatrix | None
     noise_sd: float | None
     noise_colour: NoiseColour | None
-    noise_model: Literal["white", "ar1"]
+    noise_model: FoundNoiseModel
     correlation_times: Mapping[str, float]
     noise_deviations: tuple[tuple[float, ...], ...] | None
     residual_tests: ResidualTests

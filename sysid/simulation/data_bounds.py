@@ -13,6 +13,7 @@ import numpy as np
 from sysid.core.types import FloatArray
 from sysid.core.units import divide_units, is_blank_unit
 from sysid.data.records import Channel, Record
+from sysid.models.kalman_filter import NoiseScales
 from sysid.models.parameters import RATE_UNIT, BoundsRule, Parameter
 
 Interval = tuple[float, float]
@@ -109,6 +110,12 @@ def _find_common_unit(channels: Iterable[Channel]) -> str | None:
     """Find the unit that channels share; None if they have none, or several."""
     units = {channel.unit for channel in channels if not is_blank_unit(channel.unit)}
     return units.pop() if len(units) == 1 else None
+
+
+def measure_noise_scales(records: Sequence[Record]) -> NoiseScales:
+    """Measure what bounds the noise of a plant."""
+    spans = _measure_spans(records)
+    return NoiseScales(spans.gain, spans.period, spans.duration)
 
 
 def _choose_interval(rule: BoundsRule, spans: _Spans, has_offset: bool) -> Interval:

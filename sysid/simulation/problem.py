@@ -15,12 +15,17 @@ from sysid.data.records import Record
 from sysid.kernels.compilation.build import get_kernel_address
 from sysid.kernels.layout import KernelVariant
 from sysid.kernels.signals.past_reads import list_delaying_inputs
+from sysid.models.kalman_filter import add_kalman_filter
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.model_delays import check_delays
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.starts import replace_starts
 from sysid.models.ties import Ties, apply_ties, resolve_ties
-from sysid.simulation.data_bounds import add_units_of_data, bound_by_data
+from sysid.simulation.data_bounds import (
+    add_units_of_data,
+    bound_by_data,
+    measure_noise_scales,
+)
 from sysid.simulation.evaluator import Evaluator, evaluate_population, predict_population
 from sysid.simulation.experiment_arrays import (
     PackedExperiment,
@@ -154,6 +159,9 @@ class Problem:
                 f"found {len(scoring_starts)} times for {len(records)} records. Need one each",
             )
         given, model = model, replace_starts(model, settings.initial)
+        noise = settings.loss.noise_model
+        if noise in ("plant", "load"):
+            model = add_kalman_filter(model, noise, measure_noise_scales(records))
         declared = (*model.parameters, *build_initial_parameters(model, len(records)))
         bounded = bound_by_data(add_units_of_data(declared, records), records)
         all_parameters = override_parameters(bounded, settings.parameters)
@@ -211,6 +219,11 @@ class Problem:
         return self.settings.prediction
 
     @property
+    def is_free_run(self) -> bool:
+        """Whether outputs follow from the inputs alone, and not from outputs measured before."""
+        return self.settings.prediction == "simulation" and not self.model.corrections
+
+    @property
     def loss(self) -> Loss:
         """Loss that is minimised."""
         return self.settings.loss
@@ -245,7 +258,7 @@ class Problem:
 
         If runs differ in their noise only, most of the work is done once.
         """
-        if any(parameter.bounds for parameter in self.all_parameters):
+        if any(p.bounds for p in self.all_parameters) or self.model.corrections:
             return self.rebuild(records=records)  # bounds follow the noise too
         skip, scoring_starts = self.settings.skip, self.settings.scored_from
         per_output = compute_output_weights(self.model, records, self.settings.weights, skip)
@@ -488,6 +501,12 @@ def _build_evaluator(
     settings: FitSettings,
 ) -> Evaluator:
     on_grid = all(are_on_grid(experiment.outputs) for experiment in experiments)
+    if model.corrections and not on_grid:
+        raise InvalidSettings(
+            "/loss/noise_model",
+            f"{settings.loss.noise_model} needs regular samples. Resample the record, or set "
+            "/solver/step of the model to a period that all sample times are multiples of",
+        )
     weighted = any(has_weights(e.outputs, e.grid, on_grid) for e in experiments)
     loss = settings.loss
     one_step, is_robust = settings.prediction == "one-step", loss.kind == "soft-l1"

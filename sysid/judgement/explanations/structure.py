@@ -35,7 +35,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             counted=1,
             is_vague=True,
         )
-    if context.problem.prediction == "simulation":  # predictions know the noise of their samples
+    if context.problem.is_free_run:  # predictions know the noise of their samples
         yield from _propose_zero(context)
     columns = list(_list_past_inputs(context))
     if columns:

@@ -1,0 +1,291 @@
+"""Kalman filter of a model whose noise acts inside the plant: more states, corrected by samples.
+
+The noise of a plant is a slow load at an input, or diffusion of its states. The filter adds its
+loads and its covariance P to the states of the model, so that one integrator serves all of them::
+
+    d' = -d/τ + √(2/τ) λ·w              a load, an Ornstein-Uhlenbeck process of deviation λ
+    P' = A P + P Aᵀ + Q,  A = ∂f/∂x     between samples
+    x ← x + P c (y - ŷ)/S,  P ← P - P c cᵀ P/S,  S = 1 + cᵀ P c,  c = ∂h/∂x     at a sample
+
+(Jazwinski 1970, Theorem 8.1; Kristensen, Madsen and Jørgensen, Automatica 40 (2004) 225.) All
+deviations are relative to that of the sensor, so its variance is 1 here and has a closed form in
+the likelihood. A linear model with lags of inputs has its exact filter. Others have the extended
+one, in which delayed states count as known.
+
+A load enters where its input does, but without the input's delay: before or after a dead time is
+the same for a stationary process. The innovations y - ŷ are the residuals, and their sum of squares
+is minimised: the filter-error method (Maine and Iliff 1981) in innovations form.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import sqrt
+from typing import Literal
+
+from sysid.core.errors import InvalidSettings
+from sysid.core.units import divide_units, is_blank_unit
+from sysid.language.delays import collect_past_values
+from sysid.language.derivative import (
+    ONE,
+    ZERO,
+    NoDerivativeError,
+    add,
+    differentiate,
+    divide,
+    multiply,
+    subtract,
+)
+from sysid.language.tree import (
+    Binary,
+    Expression,
+    FunctionCall,
+    Number,
+    PastValue,
+    Symbol,
+    Unary,
+    match_plain_state,
+)
+from sysid.models.model import Correction, DerivedInitial, FixedInitial, Model, ModelSignal
+from sysid.models.parameters import Parameter
+
+PlantNoise = Literal["plant", "load"]
+
+_PARAMETERS = ("load", "tau", "noise")
+_SMALLEST, _LARGEST = 1e-3, 1e3  # deviation of a load at its input over the sensor's, by spans
+_LONGEST = 10.0  # of the record: correlation time of a load
+_LEAST_SHARE, _MOST_SHARE = 1e-2, 1e4  # of the sensor's deviation: diffusion over the record
+
+
+def is_noise_parameter(name: str) -> bool:
+    """Whether a parameter is one that a filter adds: it says nothing of a free run."""
+    return name.partition("[")[0] in _PARAMETERS and name.endswith("]")
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseScales:
+    """Sizes in the data that bound the noise.
+
+    Attributes
+    ----------
+    gain : float
+        Span of the output over that of the input; nan if one of them does not move.
+    period, duration : float
+        Sampling period and duration (s).
+    """
+
+    gain: float
+    period: float
+    duration: float
+
+
+def add_kalman_filter(model: Model, noise: PlantNoise, scales: NoiseScales) -> Model:
+    """Add a Kalman filter to a model, with the parameters of its noise.
+
+    ``load`` adds a load at an input: at the first of those that enter the same equations, whose
+    loads nothing can tell apart. Its parameters are ``load[u]``, its deviation over the sensor's,
+    and ``tau[u]``, its correlation time (s). ``plant`` lets each state diffuse that is not just
+    the integral of another one: ``noise[x]``, per √s and over the sensor's deviation.
+
+    Raises
+    ------
+    InvalidSettings
+        If the model has no place for such noise, or no filter.
+    """
+    if model.form != "differential":
+        raise _refuse(noise, f"model {model.name!r} is not of the differential form")
+    if len(model.outputs) != 1:
+        raise _refuse(noise, f"the model has {len(model.outputs)} outputs, and a filter needs one")
+    model, diffusion = (_add_loads if noise == "load" else _add_diffusion)(model, scales)
+    if not diffusion:
+        raise _refuse(noise, "no input enters an equation, so there is no place for a load")
+    try:
+        return _add_covariance(model, diffusion)
+    except NoDerivativeError as error:
+        raise _refuse(noise, f"the filter cannot follow the function {error}") from None
+
+
+def _refuse(noise: PlantNoise, reason: str) -> InvalidSettings:
+    return InvalidSettings("/loss/noise_model", f"{noise} has no meaning here: {reason}")
+
+
+def _add_loads(model: Model, scales: NoiseScales) -> tuple[Model, dict[str, Expression]]:
+    """Add a state for each load; return the squared diffusion of the states that have one."""
+    diffusion: dict[str, Expression] = {}
+    for signal in _list_loaded_inputs(model):
+        load, deviation, time = f"d[{signal.name}]", f"load[{signal.name}]", f"tau[{signal.name}]"
+        size, constant = Symbol(deviation, "parameter"), Symbol(time, "parameter")
+        state = PastValue(load, "state")
+        equations = tuple(_add_to_input(tree, signal.name, state) for tree in model.equations)
+        decay = Unary("-", Binary("/", state, constant))
+        span = scales.gain if scales.gain > 0 else 1.0
+        shortest = min(scales.period, 0.1 * scales.duration)
+        model = replace(
+            model,
+            states=(*model.states, ModelSignal(load, signal.unit)),
+            equations=(*equations, decay),
+            initial=(*model.initial, FixedInitial(0.0)),
+            order=(*model.order, len(model.order)),
+            parameters=(
+                *model.parameters,
+                Parameter(
+                    deviation,
+                    _SMALLEST / span,
+                    _LARGEST / span,
+                    _divide_units(signal.unit, model.outputs[0].unit),
+                    "log",
+                ),
+                Parameter(time, shortest, _LONGEST * scales.duration, "s", "log"),
+            ),
+        )
+        power = Binary("*", Number(2.0), Binary("*", size, size))
+        diffusion[load] = Binary("/", power, constant)
+    return model, diffusion
+
+
+def _list_loaded_inputs(model: Model) -> list[ModelSignal]:
+    """List the first input of those that enter the same equations."""
+    found: dict[tuple[int, ...], ModelSignal] = {}
+    for signal in model.inputs:
+        places = tuple(
+            i
+            for i, tree in enumerate(model.equations)
+            if any(past.name == signal.name for past in collect_past_values(tree))
+        )
+        if places:
+            found.setdefault(places, signal)
+    return list(found.values())
+
+
+def _add_to_input(tree: Expression, name: str, load: Expression) -> Expression:
+    """Add a load wherever an input is read; not in delays, which contain no states."""
+    match tree:
+        case PastValue():
+            return Binary("+", tree, load) if (tree.name, tree.kind) == (name, "input") else tree
+        case Unary(operator, operand):
+            return Unary(operator, _add_to_input(operand, name, load))
+        case Binary(operator, left, right):
+            return Binary(
+                operator, _add_to_input(left, name, load), _add_to_input(right, name, load)
+            )
+        case FunctionCall(function, arguments):
+            return FunctionCall(
+                function, tuple(_add_to_input(argument, name, load) for argument in arguments)
+            )
+        case _:
+            return tree
+
+
+def _add_diffusion(model: Model, scales: NoiseScales) -> tuple[Model, dict[str, Expression]]:
+    root = sqrt(scales.duration)
+    diffusion: dict[str, Expression] = {}
+    parameters = list(model.parameters)
+    for state, equation in zip(model.states, model.equations, strict=True):
+        if match_plain_state(equation) is not None:
+            continue  # a position, whose rate alone can be disturbed
+        name = f"noise[{state.name}]"
+        unit = _divide_units(state.unit, model.outputs[0].unit)
+        lower, upper = _LEAST_SHARE / root, _MOST_SHARE / root
+        parameters.append(Parameter(name, lower, upper, f"{unit}/√s", "log"))
+        size = Symbol(name, "parameter")
+        diffusion[state.name] = Binary("*", size, size)
+    return replace(model, parameters=tuple(parameters)), diffusion
+
+
+def _divide_units(above: str, below: str) -> str:
+    return "1" if is_blank_unit(above) or is_blank_unit(below) else divide_units(above, below)
+
+
+def _add_covariance(model: Model, diffusion: Mapping[str, Expression]) -> Model:
+    """Add the covariance of all states that noise reaches, and the corrections by samples."""
+    names = [state.name for state in model.states]
+    slopes = {
+        (name, other): slope
+        for name, equation in zip(names, model.equations, strict=True)
+        for other in names
+        if (slope := differentiate(equation, other)) != ZERO
+    }
+    noisy = _find_noisy(names, slopes, diffusion)
+    pairs = [(a, b) for i, a in enumerate(noisy) for b in noisy[i:]]
+    covariance = {frozenset(pair): PastValue(f"P[{','.join(pair)}]", "state") for pair in pairs}
+    changes = [_make_rate(pair, noisy, slopes, covariance, diffusion) for pair in pairs]
+    starts = [_make_start(pair, diffusion, model) for pair in pairs]
+    return replace(
+        model,
+        states=(*model.states, *(ModelSignal(covariance[frozenset(p)].name) for p in pairs)),
+        equations=(*model.equations, *changes),
+        initial=(*model.initial, *starts),
+        order=(*model.order, *range(len(names), len(names) + len(pairs))),
+        corrections=tuple(_make_corrections(model, noisy, pairs, covariance)),
+    )
+
+
+_Slopes = Mapping[tuple[str, str], Expression]
+_Covariance = Mapping[frozenset[str], PastValue]
+
+
+def _find_noisy(
+    names: Sequence[str], slopes: _Slopes, diffusion: Mapping[str, Expression]
+) -> list[str]:
+    """Find the states that noise reaches, in the model's order."""
+    noisy = set(diffusion)
+    while reached := {a for a, b in slopes if b in noisy} - noisy:
+        noisy |= reached
+    return [name for name in names if name in noisy]
+
+
+def _make_rate(
+    pair: tuple[str, str],
+    noisy: Sequence[str],
+    slopes: _Slopes,
+    covariance: _Covariance,
+    diffusion: Mapping[str, Expression],
+) -> Expression:
+    """Make the rate of a covariance: an entry of A P + P Aᵀ + Q."""
+    first, second = pair
+    sides: list[Expression] = []
+    for one, other in ((first, second), (second, first)):
+        total: Expression = ZERO
+        for name in noisy:
+            slope = slopes.get((one, name), ZERO)
+            total = add(total, multiply(slope, covariance[frozenset((name, other))]))
+        sides.append(total)
+    if first == second:
+        return add(multiply(Number(2.0), sides[0]), diffusion.get(first, ZERO))
+    return add(*sides)
+
+
+def _make_start(
+    pair: tuple[str, str], diffusion: Mapping[str, Expression], model: Model
+) -> FixedInitial | DerivedInitial:
+    """Make the start of a covariance: a load is stationary, and the start of a state is known."""
+    first, second = pair
+    is_load = first.startswith("d[") and first in diffusion
+    if first != second or not is_load:
+        return FixedInitial(0.0)
+    size = Symbol(f"load[{first[2:-1]}]", "parameter")
+    return DerivedInitial(Binary("*", size, size), "stationary")
+
+
+def _make_corrections(
+    model: Model,
+    noisy: Sequence[str],
+    pairs: Sequence[tuple[str, str]],
+    covariance: _Covariance,
+) -> Iterator[Correction]:
+    for output in model.outputs:
+        seen = {name: differentiate(output.expression, name) for name in noisy}
+        shared: dict[str, Expression] = {}
+        variance: Expression = ONE
+        for name in noisy:
+            total: Expression = ZERO
+            for other in noisy:
+                total = add(total, multiply(covariance[frozenset((name, other))], seen[other]))
+            shared[name] = total
+            variance = add(variance, multiply(seen[name], total))
+        gains = {name: divide(shared[name], variance) for name in noisy}
+        for name in noisy:
+            yield Correction(output.name, name, gains[name], ZERO)
+        for first, second in pairs:
+            jump = subtract(ZERO, multiply(gains[first], shared[second]))
+            state = covariance[frozenset((first, second))].name
+            yield Correction(output.name, state, ZERO, jump)
