@@ -4,10 +4,10 @@ The draws of a kind have one plant, and their own load, noise and input. A load 
 Ornstein-Uhlenbeck process at the plant's input, held between the steps of a fine integration. The
 `drift` of a sensor is a random walk of its output, which no load explains.
 
-Kinds: none (noise of the sensor alone), step and binary (with the load's correlation time, s), loop
-(under PI control), drift, two-inputs, tank (outflow by the root of the level), feedback (delayed, of
-the state), unstable (under proportional control), thermal (two capacities, noise in both). Where
-the plant is linear with lags of inputs only, RMSE is divided by that of the exact Kalman
+Kinds: none (noise of the sensor alone), step and binary (with the load's correlation time, s),
+loop (under PI control), drift, two-inputs, tank (outflow by the root of the level), feedback
+(delayed, of the state), unstable (under proportional control), thermal (two capacities, noise in
+both). Where the plant is linear with lags of inputs only, RMSE is divided by that of the exact
 likelihood with all parameters free, from the same data (zero-order hold, lag between samples).
 
 An estimate counts in the coverage if its status is `identified`; else it is `held back`.
@@ -458,15 +458,9 @@ def fit_likelihood(kind: Kind, record: Record, start: Mapping[str, float]) -> di
         else [np.log(0.05)] * own + [float(y[0])] * own
     )
     first = np.array([*point, np.log(kind.sensor), *noises])
-    best = None
-    for _ in range(3):
-        options = {"maxiter": 3000, "maxfev": 3000, "xatol": 1e-4, "fatol": 1e-4, "adaptive": True}
-        found = minimize(
-            evaluate, first if best is None else best.x, method="Nelder-Mead", options=options
-        )
-        if best is not None and best.fun - found.fun < 1e-2:
-            break
-        best = found
+    best = minimize(evaluate, first, method="BFGS", options={"gtol": 1e-3})
+    again = {"maxfev": 400, "xatol": 1e-4, "fatol": 1e-4}
+    best = minimize(evaluate, best.x, method="Nelder-Mead", options=again)
     return unpack(best.x)
 
 
@@ -591,9 +585,8 @@ def main(options: argparse.Namespace) -> None:
     ]
     with get_context("spawn").Pool(options.jobs) as pool:
         outcomes = pool.imap(run_draw, tasks)
-        print(
-            "| kind | parameters | held back | noise model/verdict | CPU, s |\n|---|---|--:|---|--:|"
-        )
+        print("| kind | parameters | held back | noise model/verdict | CPU, s |")
+        print("|---|---|--:|---|--:|")
         rows = [
             row for name in names for row in summarise(name, [next(outcomes) for _ in range(draws)])
         ]
