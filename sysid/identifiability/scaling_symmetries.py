@@ -103,8 +103,9 @@ def _find_cached_scalings(
         weight = weights.weigh_expression(history.expression)
         weights.require_equal({history.state: Fraction(1)}, weight)
     for one in corrections:
-        for change in (one.gain, one.jump):
-            weights.require_equal({one.state: Fraction(1)}, weights.weigh_expression(change))
+        weights.require_equal({}, weights.weigh_expression(one.variance))
+        for state, change in (*one.gains, *one.losses):
+            weights.require_equal({state: Fraction(1)}, weights.weigh_expression(change))
     null = _solve_null_space(weights.equations, [*states, *free])
     free_rows = [[row.get(name, Fraction(0)) for name in free] for row in null]
     exponents = _reduce_to_echelon(free_rows, len(free))

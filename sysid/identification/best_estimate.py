@@ -441,7 +441,7 @@ class _EstimateSearch:
     def _may_be_ar1(self) -> bool:
         """Whether the residuals of a free run by squares are coloured: else there is no choice."""
         problem, uncertainty = self.problem, self.analysis.uncertainty
-        is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
+        is_free = problem.is_free_run and problem.loss.kind == "squares"
         is_asked = problem.loss.noise_model == "auto" and self._refines
         colour = "white" if uncertainty is None else uncertainty.noise_colour
         return is_free and is_asked and colour in ("coloured", "drifting")

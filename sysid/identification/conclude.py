@@ -60,6 +60,7 @@ from sysid.judgement.validation import find_contradictions, split_outputs, valid
 from sysid.judgement.yardstick import fit_yardstick
 from sysid.minima.minima import mark_ambiguous
 from sysid.minima.search_evidence import assess_search, is_explained
+from sysid.models.kalman_filter import find_plant_noise
 from sysid.noise_models.generalised_least_squares import resolve_noise_model
 from sysid.residuals.onset_delay import estimate_onset_delays
 from sysid.residuals.residual_tests import run_residual_tests
@@ -327,10 +328,8 @@ def _get_start(asked: Problem, starts: StartComparison | None) -> StartKind | No
 
 def _get_noise_model(problem: Problem, times: Mapping[str, float]) -> FoundNoiseModel:
     """Get the noise model of the estimates; ``ar1`` was not taken where no noise is coloured."""
-    asked = problem.loss.noise_model
-    if asked == "plant" or asked == "load":
-        return asked
-    return "ar1" if any(times.values()) else "white"
+    found = find_plant_noise(problem.given_model, problem.loss.noise_model)
+    return found or ("ar1" if any(times.values()) else "white")
 
 
 def _compute_input_history(problem: Problem) -> tuple[float, ...]:

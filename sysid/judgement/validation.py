@@ -81,7 +81,7 @@ def simulate_validation(
     validation: Problem, estimation: Problem, estimates: Sequence[Estimate]
 ) -> ValidationRun:
     """Simulate validation data with all estimates fixed, as `validate_estimates` says."""
-    model, changes = validation.untied_model, validation.settings.parameters
+    changes = validation.settings.parameters
     is_part = validation.settings.scored_from is not None
     # Other records may start otherwise, if the data were to tell how the fitted ones start.
     initial = (estimation if is_part else validation).settings.initial

@@ -23,17 +23,15 @@ from math import sqrt
 from typing import Literal
 
 from sysid.core.errors import InvalidSettings
+from sysid.core.settings import NoiseModel
 from sysid.core.units import divide_units, is_blank_unit
 from sysid.language.delays import collect_past_values
 from sysid.language.derivative import (
-    ONE,
     ZERO,
     NoDerivativeError,
     add,
     differentiate,
-    divide,
     multiply,
-    subtract,
 )
 from sysid.language.tree import (
     Binary,
@@ -45,7 +43,15 @@ from sysid.language.tree import (
     Unary,
     match_plain_state,
 )
-from sysid.models.model import Correction, DerivedInitial, FixedInitial, Model, ModelSignal
+from sysid.models.model import (
+    Correction,
+    DerivedInitial,
+    FixedInitial,
+    Model,
+    ModelSignal,
+    NoisePlaces,
+    Output,
+)
 from sysid.models.parameters import Parameter
 
 PlantNoise = Literal["plant", "load"]
@@ -53,6 +59,7 @@ PlantNoise = Literal["plant", "load"]
 _PARAMETERS = ("load", "tau", "noise")
 _SMALLEST, _LARGEST = 1e-3, 1e3  # deviation of a load at its input over the sensor's, by spans
 _LONGEST = 10.0  # of the record: correlation time of a load
+_SPAN = 4.0  # of an output in its deviations
 _LEAST_SHARE, _MOST_SHARE = 1e-2, 1e4  # of the sensor's deviation: diffusion over the record
 
 
@@ -67,24 +74,35 @@ class NoiseScales:
 
     Attributes
     ----------
-    gain : float
-        Span of the output over that of the input; nan if one of them does not move.
+    spans : mapping of str to float
+        Span of each input and output.
     period, duration : float
         Sampling period and duration (s).
     """
 
-    gain: float
+    spans: Mapping[str, float]
     period: float
     duration: float
+
+
+def find_plant_noise(model: Model, requested: NoiseModel) -> PlantNoise | None:
+    """Find the noise inside the plant that is asked for: by the setting, or by the document."""
+    if requested in ("plant", "load"):
+        return requested
+    if requested != "auto" or model.noise == NoisePlaces():
+        return None
+    return "plant" if model.noise.plant else "load"
 
 
 def add_kalman_filter(model: Model, noise: PlantNoise, scales: NoiseScales) -> Model:
     """Add a Kalman filter to a model, with the parameters of its noise.
 
-    ``load`` adds a load at an input: at the first of those that enter the same equations, whose
-    loads nothing can tell apart. Its parameters are ``load[u]``, its deviation over the sensor's,
-    and ``tau[u]``, its correlation time (s). ``plant`` lets each state diffuse that is not just
-    the integral of another one: ``noise[x]``, per √s and over the sensor's deviation.
+    ``load`` adds loads: where the document names them, else at the first of those inputs that enter
+    the same equations, whose loads nothing can tell apart. The parameters are ``load[u]``, its
+    deviation over the sensor's, and ``tau[u]``, its correlation time (s). ``plant`` lets states
+    diffuse, with the parameter ``noise[x]``, per √s and over the sensor's deviation. These are
+    the states that the document names, and its loads are added. Without them, they are all states
+    that are not just the integral of another one.
 
     Raises
     ------
@@ -93,9 +111,12 @@ def add_kalman_filter(model: Model, noise: PlantNoise, scales: NoiseScales) -> M
     """
     if model.form != "differential":
         raise _refuse(noise, f"model {model.name!r} is not of the differential form")
-    if len(model.outputs) != 1:
-        raise _refuse(noise, f"the model has {len(model.outputs)} outputs, and a filter needs one")
-    model, diffusion = (_add_loads if noise == "load" else _add_diffusion)(model, scales)
+    diffusion: dict[str, Expression] = {}
+    if noise == "plant":
+        model, diffusion = _add_diffusion(model, scales)
+    if noise == "load" or model.noise.load:
+        model, loads = _add_loads(model, scales)
+        diffusion |= loads
     if not diffusion:
         raise _refuse(noise, "no input enters an equation, so there is no place for a load")
     try:
@@ -111,27 +132,34 @@ def _refuse(noise: PlantNoise, reason: str) -> InvalidSettings:
 def _add_loads(model: Model, scales: NoiseScales) -> tuple[Model, dict[str, Expression]]:
     """Add a state for each load; return the squared diffusion of the states that have one."""
     diffusion: dict[str, Expression] = {}
-    for signal in _list_loaded_inputs(model):
+    for signal in _list_loaded(model):
         load, deviation, time = f"d[{signal.name}]", f"load[{signal.name}]", f"tau[{signal.name}]"
         size, constant = Symbol(deviation, "parameter"), Symbol(time, "parameter")
         state = PastValue(load, "state")
         equations = tuple(_add_to_input(tree, signal.name, state) for tree in model.equations)
+        outputs = tuple(
+            replace(one, expression=Binary("+", one.expression, state))
+            if one.name == signal.name
+            else replace(one, expression=_add_to_input(one.expression, signal.name, state))
+            for one in model.outputs
+        )
         decay = Unary("-", Binary("/", state, constant))
-        span = scales.gain if scales.gain > 0 else 1.0
+        ratio = _divide_spans(scales, signal.name, model)
         shortest = min(scales.period, 0.1 * scales.duration)
         model = replace(
             model,
             states=(*model.states, ModelSignal(load, signal.unit)),
             equations=(*equations, decay),
+            outputs=outputs,
             initial=(*model.initial, FixedInitial(0.0)),
             order=(*model.order, len(model.order)),
             parameters=(
                 *model.parameters,
                 Parameter(
                     deviation,
-                    _SMALLEST / span,
-                    _LARGEST / span,
-                    _divide_units(signal.unit, model.outputs[0].unit),
+                    _SMALLEST * ratio,
+                    _LARGEST * ratio,
+                    _divide_by_sensor(signal.unit, model),
                     "log",
                 ),
                 Parameter(time, shortest, _LONGEST * scales.duration, "s", "log"),
@@ -142,8 +170,10 @@ def _add_loads(model: Model, scales: NoiseScales) -> tuple[Model, dict[str, Expr
     return model, diffusion
 
 
-def _list_loaded_inputs(model: Model) -> list[ModelSignal]:
-    """List the first input of those that enter the same equations."""
+def _list_loaded(model: Model) -> list[ModelSignal | Output]:
+    """List the signals that the document names, or one input of those in the same equations."""
+    if model.noise.load:
+        return [one for one in (*model.inputs, *model.outputs) if one.name in model.noise.load]
     found: dict[tuple[int, ...], ModelSignal] = {}
     for signal in model.inputs:
         places = tuple(
@@ -154,6 +184,22 @@ def _list_loaded_inputs(model: Model) -> list[ModelSignal]:
         if places:
             found.setdefault(places, signal)
     return list(found.values())
+
+
+def _divide_spans(scales: NoiseScales, name: str, model: Model) -> float:
+    """Divide a signal's span by that of the output; several outputs count by their deviations."""
+    spans = [scales.spans.get(key, 0.0) for key in (name, model.outputs[0].name)]
+    if len(model.outputs) > 1:
+        spans[1] = _SPAN
+    return spans[0] / spans[1] if min(spans) > 0 else 1.0
+
+
+def _divide_by_sensor(unit: str, model: Model) -> str:
+    """Divide a unit by that of weighted residuals."""
+    if len(model.outputs) > 1:
+        return unit
+    other = model.outputs[0].unit
+    return "1" if is_blank_unit(unit) or is_blank_unit(other) else divide_units(unit, other)
 
 
 def _add_to_input(tree: Expression, name: str, load: Expression) -> Expression:
@@ -180,19 +226,16 @@ def _add_diffusion(model: Model, scales: NoiseScales) -> tuple[Model, dict[str, 
     diffusion: dict[str, Expression] = {}
     parameters = list(model.parameters)
     for state, equation in zip(model.states, model.equations, strict=True):
-        if match_plain_state(equation) is not None:
-            continue  # a position, whose rate alone can be disturbed
+        is_position = match_plain_state(equation) is not None  # its rate alone is disturbed
+        if state.name not in model.noise.plant if model.noise.plant else is_position:
+            continue
         name = f"noise[{state.name}]"
-        unit = _divide_units(state.unit, model.outputs[0].unit)
+        unit = _divide_by_sensor(state.unit, model)
         lower, upper = _LEAST_SHARE / root, _MOST_SHARE / root
         parameters.append(Parameter(name, lower, upper, f"{unit}/√s", "log"))
         size = Symbol(name, "parameter")
         diffusion[state.name] = Binary("*", size, size)
     return replace(model, parameters=tuple(parameters)), diffusion
-
-
-def _divide_units(above: str, below: str) -> str:
-    return "1" if is_blank_unit(above) or is_blank_unit(below) else divide_units(above, below)
 
 
 def _add_covariance(model: Model, diffusion: Mapping[str, Expression]) -> Model:
@@ -275,17 +318,14 @@ def _make_corrections(
     for output in model.outputs:
         seen = {name: differentiate(output.expression, name) for name in noisy}
         shared: dict[str, Expression] = {}
-        variance: Expression = ONE
+        variance: Expression = ZERO
         for name in noisy:
             total: Expression = ZERO
             for other in noisy:
                 total = add(total, multiply(covariance[frozenset((name, other))], seen[other]))
             shared[name] = total
             variance = add(variance, multiply(seen[name], total))
-        gains = {name: divide(shared[name], variance) for name in noisy}
-        for name in noisy:
-            yield Correction(output.name, name, gains[name], ZERO)
-        for first, second in pairs:
-            jump = subtract(ZERO, multiply(gains[first], shared[second]))
-            state = covariance[frozenset((first, second))].name
-            yield Correction(output.name, state, ZERO, jump)
+        losses = (
+            (covariance[frozenset((a, b))].name, multiply(shared[a], shared[b])) for a, b in pairs
+        )
+        yield Correction(output.name, variance, tuple(shared.items()), tuple(losses))

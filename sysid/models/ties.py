@@ -74,10 +74,7 @@ def apply_ties(model: Model, ties: Ties) -> Model:
             for history in model.histories
         ),
         corrections=tuple(
-            replace(
-                one, gain=_substitute_ties(one.gain, ties), jump=_substitute_ties(one.jump, ties)
-            )
-            for one in model.corrections
+            one.map(lambda tree: _substitute_ties(tree, ties)) for one in model.corrections
         ),
     )
 

@@ -114,8 +114,15 @@ def _find_common_unit(channels: Iterable[Channel]) -> str | None:
 
 def measure_noise_scales(records: Sequence[Record]) -> NoiseScales:
     """Measure what bounds the noise of a plant."""
-    spans = _measure_spans(records)
-    return NoiseScales(spans.gain, spans.period, spans.duration)
+    measured: dict[str, list[FloatArray]] = {}
+    for record in records:
+        for channel in (*record.inputs, *record.outputs):
+            measured.setdefault(channel.name, []).append(_drop_missing(channel).values)
+    values = {name: np.concatenate(parts) for name, parts in measured.items()}
+    spans = {name: float(np.ptp(one)) for name, one in values.items() if one.size}
+    outputs = [channel for record in records for channel in record.outputs]
+    period = min(_find_period(_drop_missing(channel)) for channel in outputs)
+    return NoiseScales(spans, period, min(record.stop - record.start for record in records))
 
 
 def _choose_interval(rule: BoundsRule, spans: _Spans, has_offset: bool) -> Interval:

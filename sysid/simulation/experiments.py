@@ -275,7 +275,7 @@ def _make_samples(
         np.where(is_known, channel.values, 0.0),
         weights,
         _interpolate_to_grid(grid, channel),
-        is_known,
+        np.where(is_known, weight, 0.0),
     )
 
 
@@ -295,7 +295,7 @@ def _replace_samples(
         np.where(is_known, channel.values, 0.0),
         samples.weights if np.array_equal(weights, samples.weights) else weights,
         _interpolate_to_grid(grid, channel),
-        is_known,
+        np.where(is_known, weight, 0.0),
     )
 
 

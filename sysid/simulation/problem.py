@@ -15,7 +15,7 @@ from sysid.data.records import Record
 from sysid.kernels.compilation.build import get_kernel_address
 from sysid.kernels.layout import KernelVariant
 from sysid.kernels.signals.past_reads import list_delaying_inputs
-from sysid.models.kalman_filter import add_kalman_filter
+from sysid.models.kalman_filter import add_kalman_filter, find_plant_noise
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.model_delays import check_delays
 from sysid.models.parameters import Parameter, override_parameters
@@ -26,7 +26,12 @@ from sysid.simulation.data_bounds import (
     bound_by_data,
     measure_noise_scales,
 )
-from sysid.simulation.evaluator import Evaluator, evaluate_population, predict_population
+from sysid.simulation.evaluator import (
+    Evaluator,
+    evaluate_population,
+    predict_ahead,
+    predict_population,
+)
 from sysid.simulation.experiment_arrays import (
     PackedExperiment,
     are_on_grid,
@@ -159,8 +164,8 @@ class Problem:
                 f"found {len(scoring_starts)} times for {len(records)} records. Need one each",
             )
         given, model = model, replace_starts(model, settings.initial)
-        noise = settings.loss.noise_model
-        if noise in ("plant", "load"):
+        noise = find_plant_noise(model, settings.loss.noise_model)
+        if noise is not None:
             model = add_kalman_filter(model, noise, measure_noise_scales(records))
         declared = (*model.parameters, *build_initial_parameters(model, len(records)))
         bounded = bound_by_data(add_units_of_data(declared, records), records)
@@ -328,6 +333,16 @@ class Problem:
         return predict_population(
             self.evaluator, _check_population(theta, len(self.free_parameters))
         )
+
+    def predict_ahead(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Predict the measured values from those before, with their deviations: (P, M) each.
+
+        A deviation is that of the innovation over the sensor's. Without a filter the values are
+        those of `predict`, and the deviations 1.
+        """
+        values = predict_ahead(self.evaluator, _check_population(theta, len(self.free_parameters)))
+        n = self.evaluator.n_measured
+        return values[:, :n], values[:, n:] if self.model.corrections else np.ones_like(values)
 
     def compute_residuals(self, theta: FloatArray) -> FloatArray:
         """Compute the weighted residuals w(ŷ - y) of the scored samples, (P, D) → (P, n)."""
@@ -504,13 +519,15 @@ def _build_evaluator(
     if model.corrections and not on_grid:
         raise InvalidSettings(
             "/loss/noise_model",
-            f"{settings.loss.noise_model} needs regular samples. Resample the record, or set "
+            "noise inside the plant needs regular samples. Resample the record, or set "
             "/solver/step of the model to a period that all sample times are multiples of",
         )
     weighted = any(has_weights(e.outputs, e.grid, on_grid) for e in experiments)
     loss = settings.loss
     one_step, is_robust = settings.prediction == "one-step", loss.kind == "soft-l1"
     variant = KernelVariant(one_step, is_robust, on_grid, weighted)
+    samples = [samples for e in experiments for samples in e.outputs]
+    weight = np.concatenate([s.weights for s in samples])
     packed = [
         pack_experiment(
             model,
@@ -522,13 +539,12 @@ def _build_evaluator(
             e.first_inputs,
             e.largest_delay_steps,
             loss.scale,
+            weight.size,
         )
         for e in experiments
     ]
     rows = [i for i, parameter in enumerate(parameters) if parameter.is_free]
     free = [parameters[i] for i in rows]
-    samples = [samples for e in experiments for samples in e.outputs]
-    weight = np.concatenate([s.weights for s in samples])
     return Evaluator(
         kernel=get_kernel_address(model, variant),
         template=np.array([p.lower if p.fixed is None else p.fixed for p in parameters]),
@@ -541,6 +557,7 @@ def _build_evaluator(
         floats=np.concatenate([experiment.floats for experiment in packed]),
         n_work=max(experiment.n_work for experiment in packed),
         n_measured=weight.size,
+        n_stored=(2 if model.corrections else 1) * weight.size,
         weight=weight,
         measured=np.concatenate([s.values for s in samples]),
         n_scored=max(float(np.count_nonzero(weight)), 1.0),

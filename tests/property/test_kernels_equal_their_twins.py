@@ -243,4 +243,6 @@ def test_a_kalman_filter_equals_its_twin(
     np.testing.assert_allclose(problem.evaluate_fitness(theta), costs, rtol=1e-8)
     kept = [i for i, name in enumerate(problem.free_names) if name not in parameters]
     white = Problem.build(model, records, skip=2).predict(theta[:, kept])
-    assert np.all(np.max(np.abs(found - white), axis=1) > 0.01)
+    is_finite = np.isfinite(costs)  # Euler steps may lose the sign of a variance
+    assert np.sum(is_finite) >= 2
+    assert np.all(np.max(np.abs(found - white)[is_finite], axis=1) > 0.01)

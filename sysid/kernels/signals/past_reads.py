@@ -154,7 +154,7 @@ def _list_states_with_history(model: Model) -> list[str]:
 
 def corrects_past(model: Model) -> bool:
     """Whether measurements correct a state that is also read in the past."""
-    corrected = {one.state for one in model.corrections}
+    corrected = {state for one in model.corrections for state, _ in one.gains}
     return not corrected.isdisjoint(stored.state for stored in list_stored_histories(model))
 
 
