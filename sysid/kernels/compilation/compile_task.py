@@ -18,6 +18,7 @@ from sysid.models.model import (
     MeasuredInitial,
     Model,
     ModelSignal,
+    NoisePlaces,
     Output,
     Solver,
 )
@@ -48,6 +49,7 @@ _TYPES = {
         MeasuredInitial,
         DerivedInitial,
         HistoryFunction,
+        NoisePlaces,
         Correction,
         Number,
         Symbol,
