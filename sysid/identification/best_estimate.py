@@ -83,6 +83,7 @@ from sysid.uncertainty.intervals import (
     keep_in_bounds,
     mark_poor_intervals,
 )
+from sysid.uncertainty.noise_sizes import explore_noise_sizes
 from sysid.uncertainty.profile_ends import FoundEnds, extrapolate_ends, find_profile_ends
 from sysid.uncertainty.unequal_noise import fit_unequal_noise
 
@@ -206,6 +207,7 @@ def find_best_estimate(
     minima = search.collect_minima(recorded)
     if explains and refines:
         search.follow_profiles(noise.theta)
+    search.average_over_noise(noise.theta)
     parameters = search.problem.free_parameters
     marked = mark_poor_intervals(parameters, search.analysis.estimates)
     marked = mark_poor_intervals(parameters, mark_changing(marked, half, limit))
@@ -517,6 +519,17 @@ class _EstimateSearch:
             if name in self.analysis.minima
         }
         estimates = compose_intervals(self.analysis.estimates, ends, beyond)
+        self.analysis = replace(self.analysis, estimates=estimates)
+
+    def average_over_noise(self, theta: FloatArray) -> None:
+        """Extend the intervals around an estimate (D,) by what sizes of noise leave open."""
+        uncertainty = self.analysis.uncertainty
+        if uncertainty is None or not self.problem.model.corrections or self._is_late():
+            return
+        left = self._budget.count_left()
+        found = explore_noise_sizes(self.problem, theta, uncertainty.covariance, left)
+        self._budget.spend(found.evaluations)
+        estimates = compose_intervals(self.analysis.estimates, found.average())
         self.analysis = replace(self.analysis, estimates=estimates)
 
     def _extrapolate_sets(

@@ -15,6 +15,7 @@ from sysid.identifiability.exchange import describe_exchanges
 from sysid.identification.best_estimate import IslandEnd, find_best_estimate, is_refining
 from sysid.identification.budget import Budget
 from sysid.identification.deadline import Clock, Deadline
+from sysid.identification.plant_noise import describe_plant_noise
 from sysid.islands.run_state import RunState
 from sysid.judgement.agreement import (
     find_better_yardstick,
@@ -60,7 +61,6 @@ from sysid.judgement.validation import find_contradictions, split_outputs, valid
 from sysid.judgement.yardstick import fit_yardstick
 from sysid.minima.minima import mark_ambiguous
 from sysid.minima.search_evidence import assess_search, is_explained
-from sysid.models.kalman_filter import find_plant_noise
 from sysid.noise_models.generalised_least_squares import resolve_noise_model
 from sysid.residuals.onset_delay import estimate_onset_delays
 from sysid.residuals.residual_tests import run_residual_tests
@@ -253,7 +253,7 @@ def _build_identification(
         problem.n_scored,
     )
     analysis = replace(analysis, estimates=conclude_estimates(estimates, findings))
-    declared = [parameter.name for parameter in problem.model.parameters]
+    declared = [parameter.name for parameter in problem.given_model.parameters]
     fit = FitPercent(
         metrics.fit_percent, None if validated is None else validated.metrics.fit_percent
     )
@@ -303,10 +303,11 @@ def _build_identification(
         warnings=list_warnings(findings),
         substeps=problem.model.solver.substeps,
         initial=_get_start(asked, best.starts),
+        plant_noise=describe_plant_noise(problem, theta, metrics.rms),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
         history=_extend_histories(best.state, best.ends),
         migrations=state.migrations,
-        simulated=split_outputs(problem, simulated),
+        simulated=split_outputs(problem, problem.predict_ahead(theta[None])[0][0]),
         simulated_validation=() if validated is None else validated.simulated,
         sample_time=problem.share("sample time", lambda: find_common_sample_time(problem.records)),
     )
@@ -328,8 +329,10 @@ def _get_start(asked: Problem, starts: StartComparison | None) -> StartKind | No
 
 def _get_noise_model(problem: Problem, times: Mapping[str, float]) -> FoundNoiseModel:
     """Get the noise model of the estimates; ``ar1`` was not taken where no noise is coloured."""
-    found = find_plant_noise(problem.given_model, problem.loss.noise_model)
-    return found or ("ar1" if any(times.values()) else "white")
+    asked = problem.loss.noise_model
+    if asked == "plant" or asked == "load":
+        return asked
+    return "ar1" if any(times.values()) else "white"
 
 
 def _compute_input_history(problem: Problem) -> tuple[float, ...]:

@@ -19,7 +19,7 @@ from sysid.models.model import Model, SelectedTerm
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import CorrelationFunction, ResidualTests
 from sysid.results.findings import Finding
-from sysid.results.parts import InputHold, OrderComparison, SearchEvidence
+from sysid.results.parts import InputHold, OrderComparison, PlantNoise, SearchEvidence
 from sysid.results.verdict import Verdict
 from sysid.search.state import Improvement, IslandSummary, Migrant
 from sysid.simulation.fit_metrics import ChannelMetrics
@@ -177,6 +177,9 @@ class Result:
         Selected terms; empty if none were to be selected.
     initial : StartKind or None
         Start of the states that the estimates assume; none: as the model's document says.
+    plant_noise : PlantNoise or None
+        Sizes of the noise, and the free run, if noise acts inside the plant. Then `rms`, fits and
+        signals are those of predictions one sample ahead.
     """
 
     valid: bool
@@ -212,6 +215,7 @@ class Result:
     substeps: int
     selection: tuple[SelectedTerm, ...]
     initial: StartKind | None = None
+    plant_noise: PlantNoise | None = None
 
     @property
     def parameter_values(self) -> dict[str, float]:

@@ -166,6 +166,7 @@ class Problem:
         given, model = model, replace_starts(model, settings.initial)
         noise = find_plant_noise(model, settings.loss.noise_model)
         if noise is not None:
+            settings = replace(settings, loss=replace(settings.loss, noise_model=noise))
             model = add_kalman_filter(model, noise, measure_noise_scales(records))
         declared = (*model.parameters, *build_initial_parameters(model, len(records)))
         bounded = bound_by_data(add_units_of_data(declared, records), records)
@@ -340,9 +341,11 @@ class Problem:
         A deviation is that of the innovation over the sensor's. Without a filter the values are
         those of `predict`, and the deviations 1.
         """
+        if not self.model.corrections:
+            simulated = self.predict(theta)
+            return simulated, np.ones_like(simulated)
         values = predict_ahead(self.evaluator, _check_population(theta, len(self.free_parameters)))
-        n = self.evaluator.n_measured
-        return values[:, :n], values[:, n:] if self.model.corrections else np.ones_like(values)
+        return values[:, : self.evaluator.n_measured], values[:, self.evaluator.n_measured :]
 
     def compute_residuals(self, theta: FloatArray) -> FloatArray:
         """Compute the weighted residuals w(ŷ - y) of the scored samples, (P, D) → (P, n)."""

@@ -280,3 +280,20 @@ def test_only_squares_and_no_other_predictions_go_with_noise_in_the_plant() -> N
         loss = Loss(noise_model=noise)  # type: ignore[arg-type]
         with pytest.raises(InvalidSettings, match="simulation"):
             Problem.build(parse_model(_lagged()), [_record()], loss=loss, prediction="one-step")
+
+
+def test_an_individual_has_the_same_bits_alone_and_among_others() -> None:
+    problem = Problem.build(
+        parse_model(_lagged()), [_record(missing=(3,))], loss=Loss(noise_model="load")
+    )
+    random = np.random.default_rng(3)
+    lower = np.array([p.lower for p in problem.free_parameters])
+    upper = np.array([p.upper for p in problem.free_parameters])
+    theta = lower * (upper / np.maximum(lower, 1e-3)) ** random.random((21, lower.size))
+    together = problem.evaluate_fitness(theta)
+    assert np.isfinite(together).any()
+    alone = [problem.evaluate_fitness(one[None])[0] for one in theta]
+    np.testing.assert_array_equal(together, alone)
+    np.testing.assert_array_equal(
+        problem.predict(theta), [problem.predict(one[None])[0] for one in theta]
+    )
