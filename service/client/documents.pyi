@@ -809,11 +809,11 @@ class InputHoldDocument(TypedDict):
 
     input: str
     """input of the model"""
-    chosen: Literal["zero", "first", "band-limited"]
+    chosen: Literal["zero", "first", "band-limited", "mean", "mean-after"]
     """how it was read"""
     reason: str | None
     """reason of a choice by the values; none if the hold was given"""
-    other: Literal["zero", "first", "band-limited"] | None
+    other: Literal["zero", "first", "band-limited", "mean", "mean-after"] | None
     """the reading that was not chosen; none if the hold was given or has no effect"""
     estimates_other: dict[str, float | None] | None
     """estimates of the free parameters with the other reading, from the estimates by least squares, in their units; none if they were not computed"""
@@ -861,8 +861,10 @@ class JobInDocument(TypedDict):
     """name of a model, `name@version`, or a whole model document"""
     channels: NotRequired[dict[str, str]]
     """recorded channel of each signal of the model; equal names need no entry"""
-    hold: NotRequired[dict[str, Literal["auto", "zero", "first", "band-limited"]]]
-    """how each input is read between its samples"""
+    hold: NotRequired[
+        dict[str, Literal["auto", "zero", "first", "band-limited", "mean", "mean-after"]]
+    ]
+    """how each input is read between its samples; of which period an output is a mean"""
     parameters: NotRequired[dict[str, ParameterInDocument]]
     """changes of the model's parameters by name"""
     prediction: NotRequired[Literal["simulation", "one-step"]]

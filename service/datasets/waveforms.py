@@ -160,7 +160,8 @@ def interpolate_channel(channel: Channel, times: FloatArray) -> FloatArray:
 
     A held channel has the value after a jump at the time of the jump.
     """
-    channel = replace(channel, history=trim_missing_history(channel.history)).history_and_samples
+    known = replace(channel, history=trim_missing_history(channel.history))
+    channel = known.acting.history_and_samples
     if channel.effective_hold != "zero":
         return np.interp(times, channel.times, channel.values)
     last = np.searchsorted(channel.times, times, side="right") - 1

@@ -259,7 +259,9 @@ class IdentificationIn(Body):
         description="recorded channel of each signal of the model; equal names need no entry",
     )
     hold: dict[str, HoldSetting] = Field(
-        default={}, description="how each input is read between its samples"
+        default={},
+        description="how each input is read between its samples; "
+        "of which period an output is a mean",
     )
     parameters: dict[str, ParameterIn] = Field(
         default={}, description="changes of the model's parameters by name"

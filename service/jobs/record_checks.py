@@ -13,11 +13,13 @@ from service.jobs.to_core import read_algorithm, read_fit
 from sysid.core.errors import RecordTooShort, SysidError, suggest_name
 from sysid.data.records import find_shared_channels
 from sysid.language.delays import has_varying_delay
+from sysid.models.channel_assignment import check_holds
 from sysid.models.model import Model
 from sysid.models.model_delays import check_record_length, compute_longest_delay, list_past_values
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.sections import get_interval
 from sysid.models.unit_checks import SignalUnits
+from sysid.simulation.output_means import MEANS, check_mean_output
 
 if TYPE_CHECKING:
     from service.storage.tables import Dataset
@@ -156,10 +158,12 @@ def find_signal_faults(body: JobBody, model: Model) -> Iterator[FieldError]:
             yield FieldError(
                 f"/channels/{name}", f"model {model.name!r} has no signal {name!r}{hint}"
             )
-    for name in body["hold"]:
-        if name not in inputs:
-            hint = suggest_name(name, inputs)
-            yield FieldError(f"/hold/{name}", f"model {model.name!r} has no input {name!r}{hint}")
+    for name, hold in body["hold"].items():
+        faults: list[FieldError] = []
+        collect_faults(check_holds, faults, model, {name: hold})
+        if name in outputs and hold in MEANS:
+            collect_faults(check_mean_output, faults, model, name, body["prediction"])
+        yield from faults
     for name, weight in (body["weights"] or {}).items():
         numbers = weight if isinstance(weight, list) else [weight]
         if name not in outputs:

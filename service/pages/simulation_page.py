@@ -354,7 +354,7 @@ def _to_input_traces(record: Record) -> tuple[SignalTrace, ...]:
             signal.values,
             signal.effective_hold == "zero",
         )
-        for signal in record.inputs
+        for signal in (channel.acting for channel in record.inputs)
     )
 
 

@@ -123,7 +123,9 @@ def _check_duration(duration: float) -> None:
 
 def _simulate_samples(plant: "_ActuatorState", supply: Channel) -> FloatArray:
     """Simulate angle and pressure; the result has shape (samples, 2)."""
-    times, values, hold = supply.times, supply.values, supply.effective_hold
+    times, acting = supply.times, supply.acting
+    last = np.searchsorted(acting.times, times + 1e-9 * np.ptp(times), side="right") - 1
+    values, hold = acting.values[np.clip(last, 0, times.size - 1)], acting.effective_hold
     simulated = np.zeros((times.size, 2))
     for k in range(times.size - 1):
         step = float(times[k + 1] - times[k])

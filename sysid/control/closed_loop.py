@@ -211,6 +211,7 @@ def _rename_parameters(model: Model, renamed: Mapping[str, str]) -> Model:
 
 def _interpolate_channel(channel: Channel, time: float, side: str) -> float:
     """Interpolate a signal just before ("left") or just after ("right") a time."""
+    channel = channel.acting
     times, values = channel.history_and_samples.times, channel.history_and_samples.values
     if channel.effective_hold != "zero":
         return float(np.interp(time, times, values))

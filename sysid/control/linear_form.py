@@ -83,7 +83,7 @@ class IdentifiedModel:
     covariance : Covariance or None
     sample_time : float or None
         Sampling period of the data in s; None if unknown or irregular.
-    holds : mapping of str to {"zero", "first", "band-limited"}
+    holds : mapping of str to {"zero", "first", "band-limited", "mean", "mean-after"}
         Behaviour of the inputs between their samples; default ``first``.
     version : str
         Version of the program that writes the text.

@@ -1,4 +1,11 @@
-"""What an input does between its samples: the choices, and the choice by its values."""
+"""What a sample says of the time beside it: the choices, and the choice by the values.
+
+An input is a value that is held or interpolated between its samples, or a mean. `mean` is that of
+the period that ends at the sample's stamp, and `mean-after` that of the period that begins there.
+A mean is all that is known of its period. So the plant sees the value for that whole period: a
+`mean` acts from the stamp before its own on, and a `mean-after` as a held value. An output is a
+value at its stamp, or a mean: then the simulated output is averaged over the same period.
+"""
 
 from collections.abc import Mapping
 from typing import Literal, NamedTuple, get_args
@@ -7,14 +14,18 @@ import numpy as np
 
 from sysid.core.types import FloatArray
 
-Hold = Literal["zero", "first", "band-limited"]
-HoldSetting = Literal["auto", "zero", "first", "band-limited"]
+Hold = Literal["zero", "first", "band-limited", "mean", "mean-after"]
+HoldSetting = Literal["auto", "zero", "first", "band-limited", "mean", "mean-after"]
 HOLDS: tuple[HoldSetting, ...] = get_args(HoldSetting)
+OUTPUT_HOLDS: tuple[HoldSetting, ...] = ("auto", "mean", "mean-after")
+"""Those of an output; ``auto`` is a value at its stamp."""
 HOLD_TEXTS: Mapping[HoldSetting, str] = {
     "auto": "decided from the data",
     "zero": "held",
     "first": "straight lines",
     "band-limited": "band-limited",
+    "mean": "mean up to its time",
+    "mean-after": "mean from its time on",
 }
 """What a signal does between its samples, in words."""
 

@@ -77,7 +77,7 @@ def interpolate_input(
     mean : {"around", "after"} or None
         Averaging of a held input; None: none.
     """
-    channel = _join_usable_history(replace(channel, hold=channel.effective_hold))
+    channel = _join_usable_history(replace(channel, hold=channel.effective_hold).acting)
     points_per_step = _count_points(channel, start, step)
     points_before = ceil(max_delay * points_per_step) + 2
     count = points_before + (steps + 2) * points_per_step + 2
@@ -147,6 +147,7 @@ def estimate_sampling_period(channel: Channel) -> float | None:
 
 def interpolate_channel(channel: Channel, times: FloatArray) -> FloatArray:
     """Interpolate a channel by its hold; outside its samples its end values hold."""
+    channel = channel.acting
     hold = channel.effective_hold
     if hold == "first" or channel.times.size < 2:
         return np.interp(times, channel.times, channel.values)

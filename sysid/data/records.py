@@ -95,8 +95,9 @@ class Channel:
         repeats may share a time.
     values : FloatArray, shape (N,)
         In `unit`; ``nan`` is a missing value.
-    hold : {"auto", "zero", "first", "band-limited"}
-        Behaviour of an input between its samples; ``auto``: chosen by its values.
+    hold : {"auto", "zero", "first", "band-limited", "mean", "mean-after"}
+        Behaviour of an input between its samples; ``auto``: chosen by its values. ``mean``: a value
+        is the mean of the period that ends at its time, of an output too.
     history : History or None
         Samples recorded before the first one. Only delayed inputs read it: simulation and
         comparison begin at the first sample. None: not recorded; the first value is assumed for
@@ -229,6 +230,43 @@ class Channel:
     def effective_hold(self) -> Hold:
         """The hold that was given, or the one chosen by the values."""
         return self.hold_choice.hold if self.hold == "auto" else self.hold
+
+    @property
+    def acting(self) -> "Channel":
+        """The signal that acts on a plant: of means, values that are held over their periods.
+
+        Raises
+        ------
+        InvalidRecord
+            If values are means of the periods before them, and their times are irregular.
+        """
+        hold = self.effective_hold
+        if hold == "mean-after":
+            return replace(self, hold="zero")
+        if hold != "mean":
+            return self
+        stamps = self.history_and_samples.times
+        begins = np.append(stamps[0] - self.read_period(), stamps[:-1])
+        first, history = begins.size - self.times.size, self.history
+        if history is not None:
+            history = history._replace(times=begins[:first])
+        return replace(self, times=begins[first:], history=history, hold="zero")
+
+    def read_period(self) -> float:
+        """Return the period (s) that values are means of.
+
+        Raises
+        ------
+        InvalidRecord
+            If the times are irregular.
+        """
+        if not self.sampling.is_regular:
+            raise InvalidRecord(
+                f"channel {self.name!r} has means (hold '{self.hold}'), but its times are "
+                f"irregular: {self.sampling}. What a mean covers is not known. Resample it first, "
+                "or choose another hold"
+            )
+        return self.sampling.period
 
     @property
     def history_and_samples(self) -> "Channel":
@@ -559,7 +597,7 @@ class Recording:
     def to_record(
         self, inputs: Mapping[str, str], outputs: Mapping[str, str], name: str = ""
     ) -> "Record":
-        """Return the recording as one experiment of a model.
+        """Return the recording as one experiment of a model, with the other channels beside it.
 
         Parameters
         ----------
@@ -589,6 +627,7 @@ class Recording:
                 for role, name_in_recording in outputs.items()
             ),
             name,
+            tuple(c for c in self.channels if c.name not in {*inputs.values(), *outputs.values()}),
         )
 
     def to_records(
@@ -687,6 +726,14 @@ class Record:
     polars. If the times are dates, all channels are in seconds from the first date of any of them,
     their `started_at`. Channels usually have the names of the model's signals.
 
+    Attributes
+    ----------
+    inputs, outputs : tuple of Channel
+    name : str
+    others : tuple of Channel
+        What was recorded beside them, on the same clock. No simulation reads it, and a part of a
+        record keeps all of it. Explanations of residuals look there for another input.
+
     Examples
     --------
     >>> t = [0.0, 0.1, 0.2, 0.3]
@@ -699,10 +746,17 @@ class Record:
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
     name: str = ""
+    others: tuple[Channel, ...] = ()
 
     if TYPE_CHECKING:
 
-        def __init__(self, inputs: Channels, outputs: Channels, name: str = "") -> None: ...
+        def __init__(
+            self,
+            inputs: Channels,
+            outputs: Channels,
+            name: str = "",
+            others: tuple[Channel, ...] = (),
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         sides = [(self.inputs, "the input side"), (self.outputs, "the output side")]
@@ -739,8 +793,11 @@ class Record:
         return _to_frame((*self.inputs, *self.outputs))
 
     def replace_holds(self, holds: Mapping[str, HoldSetting]) -> "Record":
-        """Return the record with other intersample behaviour of some inputs."""
-        return replace(self, inputs=_replace_holds(self.inputs, holds)) if holds else self
+        """Return the record with other intersample behaviour of some inputs and outputs."""
+        if not holds:
+            return self
+        inputs, outputs = (_replace_holds(side, holds) for side in (self.inputs, self.outputs))
+        return replace(self, inputs=inputs, outputs=outputs)
 
     @property
     def history_duration(self) -> float:

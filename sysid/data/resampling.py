@@ -30,7 +30,8 @@ def resample_recording(recording: Recording, arguments: StepArguments) -> Record
     This avoids aliasing. A channel with zero-order hold is averaged over the period for which the
     value is then held. Its jumps, and delays after them, are right on average.
 
-    A hold that is chosen by the values is chosen before, and kept.
+    A hold that is chosen by the values is chosen before, and kept. Means of periods become held
+    values.
 
     The grid extends backwards through a channel's earlier samples: its history, and samples
     before the grid. Only the first segment has a history.
@@ -52,7 +53,7 @@ def resample_recording(recording: Recording, arguments: StepArguments) -> Record
     read = _average_periods if method == "mean" else _interpolate_values
     channels = []
     for recorded in recording.channels:
-        channel = replace(recorded, hold=recorded.effective_hold)
+        channel = replace(recorded, hold=recorded.effective_hold).acting
         first, *later = [channel.slice_time(*span) for span in spans]
         begun = _resample_channel(first, grids[0], period, read)
         values = [begun.values]

@@ -63,6 +63,13 @@ def _describe_hold(identified: IdentifiedModel, name: str) -> str:
     hold = identified.get_hold(name)
     if hold == "zero":
         return f"Input {name} is held from each sample to the next."
+    if hold == "mean-after":
+        return f"Input {name} is a mean from each sample to the next, and held there."
+    if hold == "mean":
+        return (
+            f"Input {name} was a mean from each sample to the next one, where it was stamped. Here "
+            "it is held from each sample to the next: give each mean one sample earlier."
+        )
     if hold == "first":
         return f"Input {name} is interpolated linearly between its samples."
     return (

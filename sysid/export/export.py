@@ -57,7 +57,7 @@ def export_model(
     sample_time : float, optional
         Sampling period of the data in s; a transfer function in z needs it. Default: the one of
         the result.
-    hold : mapping of str to {"zero", "first", "band-limited"}, optional
+    hold : mapping of str to {"zero", "first", "band-limited", "mean", "mean-after"}, optional
         Behaviour of inputs between their samples. Default: as in the data of the result, or
         ``first``.
     version, provenance : optional

@@ -283,7 +283,7 @@ class LoopScope(ExportScope):
     def _write_input(self, past: PastValue) -> str:
         program = self.program
         name, substeps = program.input_names[past.name], program.substeps
-        held = program.identified.get_hold(past.name) == "zero"
+        held = program.identified.get_hold(past.name) not in ("first", "band-limited")
         early = self.stage == "output" and past.offset > 0  # may lie before the record
         if past.delay is None and program.grid_step is None and not early:
             if held:

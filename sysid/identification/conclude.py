@@ -21,6 +21,7 @@ from sysid.judgement.agreement import (
     find_better_yardstick,
     find_constant_outputs,
     find_disagreement,
+    find_exchanged_channels,
 )
 from sysid.judgement.conclusions import (
     conclude_estimates,
@@ -200,6 +201,7 @@ def _build_identification(
     )
     findings = order_findings(
         [
+            *(find_exchanged_channels(problem, simulated, metrics) if compares_orders else ()),
             *find_disagreement(metrics, limit, are_residuals_noise=are_noise),
             *find_constant_outputs(problem),
             *find_better_yardstick(

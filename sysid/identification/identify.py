@@ -54,9 +54,11 @@ def identify(request: IdentificationRequest) -> Identification:
         channel of its name, then one of a usual name such as ``output`` or ``PV``. If as many
         channels are left as signals, their order decides, inputs first. A warning of the result
         says so.
-    hold : mapping of str to {"auto", "zero", "first", "band-limited"}
+    hold : mapping of str to {"auto", "zero", "first", "band-limited", "mean", "mean-after"}
         How an input is read between its samples: ``{"u": "first"}`` as straight lines, ``"zero"``
-        held. Default: as its channel says, else by its values. It holds for `validation` too.
+        held, ``"mean"`` as the mean of the period that ends at its time. Outputs may be means too:
+        ``{"y": "mean"}``. Default: as the channel says, else by its values. It holds for
+        `validation` too.
     seed : int
         The same seed gives the same result, bit for bit.
     parameters : mapping

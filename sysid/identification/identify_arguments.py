@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from math import isfinite
 from numbers import Real
 from os import PathLike
@@ -9,12 +10,13 @@ from typing import Any, NamedTuple, TypeAlias
 
 from sysid.core.errors import InvalidRecord, InvalidSettings, join_pointer, suggest_name
 from sysid.data.foreign_tables import (
+    Column,
     Labelled,
     describe_object,
     is_labelled,
     read_columns,
 )
-from sysid.data.holds import HOLDS, HoldSetting
+from sysid.data.holds import HoldSetting
 from sysid.data.records import Channel, Record, Recording, to_channel
 from sysid.data.value_checks import find_infinite_value
 from sysid.models.channel_assignment import (
@@ -22,6 +24,7 @@ from sysid.models.channel_assignment import (
     assign_channels,
     assign_record,
     assign_recording,
+    check_holds,
 )
 from sysid.models.model import Model
 from sysid.residuals.onset_delay import find_unprompted_output
@@ -47,7 +50,7 @@ def read_records(
     channels: Mapping[str, str] | None,
     hold: Mapping[str, HoldSetting] | None = None,
 ) -> ReadRecords:
-    """Read recordings as records of a model, with the given holds of its inputs.
+    """Read recordings as records of a model, with the given holds of its signals.
 
     A recording of several segments gives one record for each.
 
@@ -56,31 +59,31 @@ def read_records(
     InvalidRecord
         If an object is no recording, or a signal has no channel.
     InvalidSettings
-        If `channels` names a signal or channel that does not exist, or `hold` an input or a hold.
+        If `channels` names a signal or channel that does not exist, or `hold` a signal or a hold.
+        If values at irregular times are to be means.
     """
     holds = dict(hold or {})
-    _check_holds(model, holds)
+    check_holds(model, holds)
     each = data if isinstance(data, list | tuple) else [data]
     parts = [part for one in each for part in _read_one(model, one, channels)]
     records = tuple(record.replace_holds(holds) for record, _ in parts)
     for record in records:
         if fault := find_infinite_value((*record.inputs, *record.outputs)):
             raise InvalidRecord(fault)
+        _check_means(record, holds)
     assignments = {assigned.note: assigned for _, assigned in parts if assigned.note}
     notes = tuple(describe_assignment(one, records) for one in assignments.values())
     by_signal = parts[0][1].by_signal if parts else {}
     return ReadRecords(records, notes, by_signal)
 
 
-def _check_holds(model: Model, holds: Mapping[str, object]) -> None:
-    inputs = [signal.name for signal in model.inputs]
-    for name, hold in holds.items():
-        pointer = join_pointer("hold", str(name))
-        if name not in inputs:
-            hint = suggest_name(str(name), inputs)
-            raise InvalidSettings(pointer, f"model {model.name!r} has no input {name!r}{hint}")
-        if not isinstance(hold, str) or hold not in HOLDS:
-            raise InvalidSettings(pointer, f"found {hold!r}; need one of {', '.join(HOLDS)}")
+def _check_means(record: Record, holds: Mapping[str, HoldSetting]) -> None:
+    for channel in (*record.inputs, *record.outputs):
+        if "mean" in holds.get(channel.name, ""):
+            try:
+                channel.read_period()
+            except InvalidRecord as error:
+                raise InvalidSettings(join_pointer("hold", channel.name), str(error)) from None
 
 
 def write_setting(field: str, entries: Mapping[str, str]) -> str:
@@ -141,13 +144,24 @@ def _read_one(
         plain = {key: by_label.get(str(name), name) for key, name in (channels or {}).items()}
         assigned = assign_channels(model, [column.name for column in columns], plain)
         used = set(assigned.by_signal.values())
-        recording = Recording(tuple(to_channel(c) for c in columns if c.name in used))
+        others = _read_others([column for column in columns if column.name not in used])
+        recording = Recording((*(to_channel(c) for c in columns if c.name in used), *others))
     else:
         raise InvalidRecord(_describe_wrong_data(data))
     inputs = {signal.name: assigned.by_signal[signal.name] for signal in model.inputs}
     outputs = {output.name: assigned.by_signal[output.name] for output in model.outputs}
     for record in recording.to_records(inputs, outputs):
         yield record, assigned
+
+
+def _read_others(columns: Sequence[Column]) -> Iterator[Channel]:
+    """Read columns that the model does not use; those without numbers are left out."""
+    for column in columns:
+        times, start = column.axis
+        with suppress(InvalidRecord):
+            channel = Channel(column.name, times, column.values, column.unit, started_at=start)
+            if find_infinite_value([channel]) is None:
+                yield channel
 
 
 def _describe_wrong_data(data: object) -> str:

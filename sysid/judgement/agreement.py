@@ -7,9 +7,10 @@ import numpy as np
 
 from sysid.core.distributions import chi_square_limit
 from sysid.core.text import join_names
+from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.judgement.levels import STRONG_ODDS, UNLIKELY
-from sysid.judgement.yardstick import Yardstick
+from sysid.judgement.yardstick import NOTABLE_SHARE, Yardstick, fit_reverse, fit_yardstick
 from sysid.results.findings import Finding, Severity
 from sysid.simulation.fit_metrics import ChannelMetrics, Metrics
 from sysid.simulation.problem import Problem
@@ -84,6 +85,42 @@ def find_better_yardstick(
         None if is_explained else gain,
         parameters=() if is_explained else tuple(names),
     )
+
+
+def find_exchanged_channels(
+    problem: Problem, simulated: FloatArray, metrics: Metrics
+) -> Iterator[Finding]:
+    """Find an input that an output explains where the model explains little of that output.
+
+    A linear model of the cause explains its effect, and not the other way round: that would have
+    to know the future. So it must explain left-out blocks of the input clearly better than both
+    the model and a linear one explain the output. Only a failed model is asked.
+    """
+    if not metrics.fit_percent < _LITTLE:
+        return
+    forward: Yardstick | None = None
+    for effect in problem.output_weights:
+        for cause in (channel.name for channel in problem.model.inputs):
+            reverse = fit_reverse(problem, simulated, cause, effect)
+            if reverse is None or not reverse.is_clearly_better:
+                continue
+            forward = forward or fit_yardstick(problem, simulated)
+            own = 0.0 if forward is None else forward.fit_percent
+            if (100.0 - reverse.fit_percent) ** 2 > (1.0 - NOTABLE_SHARE) * (100.0 - own) ** 2:
+                continue
+            yield Finding(
+                "exchanged channels",
+                "record",
+                "serious",
+                f"{effect} drives {cause}: their channels are exchanged, or the loop is closed",
+                f"a linear model of {effect} explains {reverse.fit_percent:.0f} % of {cause} in "
+                f"blocks that were left out of it, and this model {metrics.fit_percent:.0f} % of "
+                f"{effect}. So {effect} is the cause of {cause}.",
+                f"Give {cause} the channel of {effect}, and {effect} that of {cause}. If a "
+                f"controller moves {cause}, excite its set point instead.",
+                2.0 * reverse.gain,
+                status="refuted",
+            )
 
 
 def find_constant_outputs(problem: Problem) -> Iterator[Finding]:

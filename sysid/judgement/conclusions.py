@@ -28,7 +28,11 @@ _MOST_GAIN = 100.0  # that tells from a larger one: the odds are beyond any doub
 _MOST_REASONS = 2  # of an estimate, and in a verdict
 
 _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
-_OF_RECORD = ("constant output", "constant input")  # then nothing else says anything
+_OF_RECORD = (
+    "constant output",
+    "constant input",
+    "exchanged channels",
+)  # then nothing else says anything
 _FAILURES = ("constant", "little fit", "straight line")
 _RANKS: tuple[EstimateStatus, ...] = (
     "identified",

@@ -102,6 +102,7 @@ def _find_first_time(record: Record) -> float:
 
 def average_input(channel: Channel, edges: FloatArray) -> FloatArray:
     """Average an input between the edges (G + 1,); its ends are held outside the record."""
+    channel = channel.acting
     whole = channel.history_and_samples
     known = np.isfinite(whole.values)
     times, values = whole.times[known], whole.values[known]

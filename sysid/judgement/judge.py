@@ -13,9 +13,11 @@ from sysid.judgement.explanations import (
     actuator,
     constancy,
     history,
+    other_input,
     reading,
     sensor,
     structure,
+    switches,
 )
 from sysid.judgement.explanations.noise import (
     find_disagreement_of_frequencies,
@@ -40,8 +42,9 @@ _PROPOSERS = (
     structure.propose,
     history.propose,
     reading.propose,
+    other_input.propose,
 )
-_COSTLY_PROPOSERS = (actuator.propose, actuator.propose_loads)
+_COSTLY_PROPOSERS = (actuator.propose, actuator.propose_loads, switches.propose)
 """Each of their explanations takes a simulation: only if the residuals depend on anything."""
 _LIKELY = 0.01  # of the ratio of one candidate: then the costly ones are looked at as well
 _BY_ORDER = ("one more time constant", "filter of a sensor")  # another order is the full fit
@@ -49,7 +52,7 @@ _MOST_SHARE = 0.5  # columns for a sample: with 0.8, noise gains 12 in one of 20
 _MOST_FINDINGS = 3  # that are found beside each other
 _MOST_TOLD = 3  # moves in a sentence
 _MOST_RIVALS = 2  # in a sentence
-_MOST_REFITTED = 3  # explanations that are fitted in full
+_MOST_REFITTED = 6  # explanations that are fitted in full
 
 
 class _Scored(NamedTuple):
@@ -192,11 +195,12 @@ def _refit_finalists(
 ) -> list[_Scored]:
     """Fit in full the likeliest explanations of which each is another record.
 
-    They may move the parameters by far more than a linear step.
+    They may move the parameters by far more than a linear step. Of a whole other record, the full
+    fit counts: a column may be scaled, and then says something else.
     """
     refitted, tried = list(scored), dict[str, int]()
     for position, one in enumerate(scored):
-        name = one.candidate.explanation
+        name = one.candidate.text if one.candidate.is_whole else one.candidate.explanation
         if len(tried) == _MOST_REFITTED or one.gain <= 0.0:
             break
         if one.candidate.records is None or name in tried:
@@ -207,7 +211,9 @@ def _refit_finalists(
             continue
         used = (1 + one.candidate.counted) * np.log(max(context.times.size, 2))
         gain = float(criterion - found.criterion - used)
-        if gain > one.gain - STRONG_ODDS:
+        if one.candidate.is_whole:
+            refitted[position] = one._replace(gain=gain, moves=found.moves)
+        elif gain > one.gain - STRONG_ODDS:
             refitted[position] = one._replace(gain=max(gain, one.gain), moves=found.moves)
     parted = _part_finalist(context, scored, criterion)
     return _order([*refitted, *parted])

@@ -63,6 +63,8 @@ class Candidate:
         Where something changes, s.
     records : sequence of Record, or None
         Records with which the model is fitted again, for moves that are not linear.
+    is_whole : bool
+        Whether these records are all that it says, as another reading is: not a share of them.
     doubtful : collection of str
         Parameters that take its place in the model, whatever the step to it: a time lag that of
         missing parts, and of clocks.
@@ -83,6 +85,7 @@ class Candidate:
     varies: tuple[int, float, float] | None = None
     moment: float | None = None
     records: Sequence[Record] | None = None
+    is_whole: bool = False
     doubtful: Collection[str] = ()
     is_vague: bool = False
     is_added: bool = False
@@ -460,14 +463,24 @@ class ResidualContext:
         """
         values = np.zeros(self.times.size)
         for part in self.parts:
-            period = float(np.ptp(part.times)) / max(part.times.size - 1, 1)
             for channel in self.problem.records[part.experiment].inputs:
                 if channel.name == name:
-                    after = _AFTER if channel.effective_hold == "zero" else 0.0
-                    values[part.rows] = interpolate_channel(
-                        channel, part.times + (after - lag) * period
-                    )
+                    values[part.rows] = read_channel(channel, part.times, lag)
         return values
+
+    def choose_columns(self, columns: FloatArray) -> list[int]:
+        """Choose the likeliest of columns (n, q) of the outputs, under white and coloured noise."""
+        model, chosen = self.residual_model, dict[int, None]()
+        weighted = self.weigh(columns)
+        for noise, basis, residual in self._bases:
+            whitened = (weighted if noise is None else model.whiten(weighted, noise))[self._order]
+            own = np.sum(np.square(whitened), axis=0)
+            rest = own - np.sum(np.square(basis.T @ whitened), axis=0)
+            is_own = rest > _OWN_SHARE * own
+            score = np.where(is_own, (residual @ whitened) ** 2 / np.where(is_own, rest, 1.0), 0.0)
+            if score.any():
+                chosen[int(np.argmax(score))] = None
+        return list(chosen)
 
     def find_breaks(self, column: FloatArray) -> list[tuple[float, FloatArray, str]]:
         """Find where a column (n,) most likely begins to count, under white and coloured noise.
@@ -583,6 +596,27 @@ class ResidualContext:
                     rows[part.rows] = True
             if rows.any():
                 yield output.name, rows, format_unit(output.unit)
+
+
+def read_channel(channel: Channel, times: FloatArray, lag: float = 0.0) -> FloatArray:
+    """Read a channel at times (n,) of samples, `lag` periods before; missing values are bridged.
+
+    A held one is read after its jump.
+    """
+    channel = channel.acting
+    period = float(np.ptp(times)) / max(times.size - 1, 1)
+    after = _AFTER if channel.effective_hold == "zero" else 0.0
+    return interpolate_known(channel, times + (after - lag) * period)
+
+
+def interpolate_known(channel: Channel, times: FloatArray) -> FloatArray:
+    """Interpolate the values of a channel that are not missing."""
+    known = np.isfinite(channel.values)
+    if not known.all():
+        channel = replace(
+            channel, times=channel.times[known], values=channel.values[known], repeats=None
+        )
+    return interpolate_channel(channel, times)
 
 
 class Refitted(NamedTuple):

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.fft import rfft
 
 from sysid.core.types import FloatArray, IntArray
+from sysid.data.interpolation import interpolate_channel
 from sysid.data.records import Record
 from sysid.judgement.input_grid import GridRows, InputGrid, average_rows, make_input_grid
 from sysid.judgement.left_out_blocks import LEAST_SHARE, fit_better_orders, simulate_left_out
@@ -110,6 +111,43 @@ def fit_yardstick(problem: Problem, simulated: FloatArray) -> Yardstick | None:
     compared = [_compare(problem.records, table) for table in tables if table is not None]
     known = [yardstick for yardstick in compared if yardstick is not None]
     return max(known, key=lambda one: (one.is_clearly_better, one.gain), default=None)
+
+
+def fit_reverse(
+    problem: Problem, simulated: FloatArray, cause: str, effect: str
+) -> Yardstick | None:
+    """Fit linear models to an input with an output as their input, and compare as fits in %.
+
+    The user's model counts as if it left the same share of the input as it leaves of the output.
+
+    Parameters
+    ----------
+    simulated : FloatArray, shape (M,)
+        Values that the user's model simulates at the measured times.
+    cause, effect : str
+        Input and output of the model.
+    """
+    samples = _read_outputs(problem, simulated, effect)
+    if samples is None:
+        return None
+    measured, records = np.zeros(samples.times.size), list[Record]()
+    for number, record in enumerate(problem.records):
+        [given] = [one for one in record.inputs if one.name == cause]
+        [answer] = [one for one in record.outputs if one.name == effect]
+        own = samples.experiment == number
+        measured[own] = interpolate_channel(replace(given, hold="first"), samples.times[own])
+        known = np.isfinite(answer.values)
+        driver = replace(
+            answer, times=answer.times[known], values=answer.values[known], hold="first"
+        )
+        records.append(replace(record, inputs=(driver,)))
+    spread = float(np.std(measured))
+    if spread <= ROUNDING_SHARE * float(np.max(np.abs(measured))):
+        return None
+    left = (samples.measured - samples.simulated) * spread / float(np.std(samples.measured))
+    return _compare(
+        records, samples._replace(output=cause, measured=measured, simulated=measured - left)
+    )
 
 
 class _Samples(NamedTuple):

@@ -10,7 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
-from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
+from sysid.core.errors import InvalidRecord, InvalidSettings, join_pointer, suggest_name
+from sysid.data.holds import HOLDS, OUTPUT_HOLDS
 from sysid.data.records import Channel, Record, Recording
 from sysid.data.table_rules import split_headings
 from sysid.models.model import Model
@@ -344,3 +345,25 @@ def _describe_guess(guessed: Mapping[str, str], basis: str, option: ChannelOptio
     if not guessed:
         return ""
     return f"channels were assigned by {basis}. To choose, give {option(guessed)}"
+
+
+def check_holds(model: Model, holds: Mapping[str, object]) -> None:
+    """Check the holds of signals.
+
+    Raises
+    ------
+    InvalidSettings
+        If there is no such signal, or no such hold of an input or an output.
+    """
+    inputs = [signal.name for signal in model.inputs]
+    outputs = [signal.name for signal in model.outputs]
+    for name, hold in holds.items():
+        pointer = join_pointer("hold", str(name))
+        if name not in (*inputs, *outputs):
+            hint = suggest_name(str(name), (*inputs, *outputs))
+            detail = f"model {model.name!r} has no input or output {name!r}{hint}"
+            raise InvalidSettings(pointer, detail)
+        known, side = (HOLDS, "") if name in inputs else (OUTPUT_HOLDS, " for an output")
+        if not isinstance(hold, str) or hold not in known:
+            detail = f"found {hold!r}; need one of {', '.join(known)}{side}"
+            raise InvalidSettings(pointer, detail)

@@ -153,6 +153,7 @@ def compute_lagged_sums(
     lags: FloatArray,
 ) -> LaggedSums | str:
     """Compute the sums over some lags, or the reason why there are none."""
+    channel = channel.acting
     floats = (spaced.times, channel.times, channel.values, lags)
     shifted = _build_lagged_inputs(
         spaced.present.tobytes(),

@@ -109,6 +109,7 @@ def compute_explained_share(series: ResidualSeries, channel: Channel) -> float:
     spaced = space_residuals(times, residual)
     if not spaced.is_regular:
         return 0.0
+    channel = channel.acting
     # A held input is read after its jump, not as the mean of both sides.
     after = 0.25 * spaced.period if channel.effective_hold == "zero" else 0.0
     values = interpolate_channel(channel, spaced.times + after)

@@ -108,7 +108,7 @@ def estimate_onset_delays(model: Model, records: Sequence[Record]) -> tuple[Onse
             number, cause, response, [channel for channel in moving if channel is not cause]
         )
         for number, record in enumerate(records)
-        for moving in [[channel for channel in record.inputs if channel.name in inputs]]
+        for moving in [[one.acting for one in record.inputs if one.name in inputs]]
         for cause in moving
         for response in record.outputs
         if response.name in outputs
@@ -126,7 +126,8 @@ def find_unprompted_output(
     ranges of the outputs over all records: in one in which nothing moves, noise has all the range.
     """
     first_input_move = min(
-        (_find_first_move(channel.history_and_samples) for channel in record.inputs), default=-inf
+        (_find_first_move(channel.acting.history_and_samples) for channel in record.inputs),
+        default=-inf,
     )
     early_outputs = []
     for output in record.outputs:

@@ -425,6 +425,7 @@ def _join_validation(
 
 def to_signal_trace(channel: Channel) -> SignalTrace:
     """Convert a channel with its history to a line of a figure."""
+    channel = channel.acting
     held, before = channel.effective_hold == "zero", None
     if channel.history is not None:  # including the first sample, so that the lines meet
         pairs = zip(channel.history, (channel.times, channel.values), strict=True)

@@ -86,7 +86,7 @@ class InputHold:
     ----------
     input : str
         Input of the model.
-    chosen : {"zero", "first", "band-limited"}
+    chosen : {"zero", "first", "band-limited", "mean", "mean-after"}
         How it was read.
     reason : str or None
         Reason of a choice by the values; none if the hold was given.

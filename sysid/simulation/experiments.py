@@ -30,6 +30,7 @@ from sysid.simulation.experiment_arrays import (
     interpolate_inputs,
 )
 from sysid.simulation.grid import Grid, locate_samples, make_grid
+from sysid.simulation.output_means import average_outputs, locate_mean
 
 # Weights outside this range are mistakes. Squares of weighted residuals could overflow.
 _MIN_WEIGHT, _MAX_WEIGHT = 1e-100, 1e100
@@ -157,8 +158,10 @@ def place_on_grid(
         If the record does not have what the model needs.
     """
     inputs = [_find_input(record, quantity.name) for quantity in model.inputs]
-    outputs = _select_outputs(model, record, None if simulates_only else (skip, scored_from))
-    grid = make_grid(model, inputs, outputs)
+    selected = _select_outputs(model, record, None if simulates_only else (skip, scored_from))
+    located = [locate_mean(channel) for channel in selected]
+    outputs = [channel for channel, _ in located]
+    grid = make_grid(model, inputs, outputs, min(begin for _, begin in located))
     if is_difference(model) and grid.last_step < model.memory:
         needed = model.memory * grid.integration_step
         raise RecordTooShort(grid.duration, needed, "the model's memory")
@@ -170,13 +173,15 @@ def place_on_grid(
         p.name: (p.lower, p.upper) if p.fixed is None else (p.fixed, p.fixed) for p in parameters
     }
     rows = {p.name: i for i, p in enumerate(parameters)}
+    averaged = average_outputs(model, [record])
+    added = len(averaged.states) - len(model.states)
     return GridExperiment(
         grid,
         tuple(interpolate_inputs(model, inputs, spans, grid)),
         tuple(_make_samples(model, grid, c, weights[c.name], skip, since[c.name]) for c in outputs),
-        tuple(_make_starts(model, grid, outputs, experiment, rows)),
+        (*_make_starts(model, grid, outputs, experiment, rows), *_start_integrals(added)),
         tuple(_read_first_value(channel, grid.start) for channel in inputs),
-        max([0.0, *find_largest_delays(model, "state", spans, grid).values()]),
+        max([0.0, *find_largest_delays(averaged, "state", spans, grid).values()]),
     )
 
 
@@ -191,7 +196,9 @@ def replace_outputs(
     scored_from: float,
 ) -> GridExperiment:
     """Replace the outputs of a placed experiment; the record has the same inputs and times."""
-    outputs, grid = _select_outputs(model, record, (skip, scored_from)), placed.grid
+    selected, grid = _select_outputs(model, record, (skip, scored_from)), placed.grid
+    outputs = [locate_mean(channel)[0] for channel in selected]
+    added = len(placed.starts) - len(model.states)
     since = _find_scoring_starts(model, grid, scored_from)
     rows = {p.name: i for i, p in enumerate(parameters)}
     return replace(
@@ -200,7 +207,7 @@ def replace_outputs(
             _replace_samples(samples, grid, c, weights[c.name], skip, since[c.name])
             for samples, c in zip(placed.outputs, outputs, strict=True)
         ),
-        starts=tuple(_make_starts(model, grid, outputs, experiment, rows)),
+        starts=(*_make_starts(model, grid, outputs, experiment, rows), *_start_integrals(added)),
     )
 
 
@@ -329,8 +336,14 @@ def _make_starts(
     return starts
 
 
+def _start_integrals(count: int) -> list[StateStart]:
+    """Start the integrals of outputs that are means."""
+    return [StateStart(np.zeros(1))] * count
+
+
 def _read_first_value(channel: Channel, start: float) -> float:
     """Read an input at the start of the simulation: its first value if it begins later."""
+    channel = channel.acting
     if channel.hold == "zero":
         last = int(np.searchsorted(channel.times, start, side="right")) - 1
         return float(channel.values[max(last, 0)])

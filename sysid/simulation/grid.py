@@ -58,8 +58,10 @@ class Grid:
         return np.clip(snapped, 0.0, self.points - 1.0)
 
 
-def make_grid(model: Model, inputs: Sequence[Channel], outputs: Sequence[Channel]) -> Grid:
-    """Make the grid on which a model is compared with an experiment.
+def make_grid(
+    model: Model, inputs: Sequence[Channel], outputs: Sequence[Channel], since: float
+) -> Grid:
+    """Make the grid on which a model is compared with an experiment, from `since` (s) at least.
 
     Raises
     ------
@@ -72,7 +74,7 @@ def make_grid(model: Model, inputs: Sequence[Channel], outputs: Sequence[Channel
         return _make_sample_grid(outputs, model.solver.substeps)
     step = model.solver.step or _choose_simulation_step(outputs)
     first = min(float(channel.times[0]) for channel in outputs)
-    begin = min([first, *(float(channel.times[0]) for channel in inputs)])
+    begin = min([first, since, *(float(channel.times[0]) for channel in inputs)])
     end = max(float(channel.times[-1]) for channel in outputs)
     _check_length((end - begin) / step * model.solver.substeps)
     start = first - ceil((first - begin) / step - 1e-6) * step

@@ -55,6 +55,7 @@ from sysid.simulation.fit_metrics import (
     compute_mean,
     rms,
 )
+from sysid.simulation.output_means import average_outputs
 
 _Value = TypeVar("_Value")
 _ReduceResult = tuple[Callable[..., "Problem"], tuple[Any, ...]]
@@ -65,12 +66,15 @@ class Problem:
     """Fitness and predictions of candidates, J = √(Σ w²(y - ŷ)² / n) (Eq. 10).
 
     Create it with `Problem.build` or `Problem.from_settings`. Pickling sends the arguments of its
-    construction, because the address of compiled code is valid in one process only.
+    construction, because the address of compiled code is valid in one process only. What records
+    have beside the model's signals is not sent: a search does not read it.
 
     Attributes
     ----------
     model : Model
         With tied parameters replaced by their expressions.
+    averaged_model : Model
+        The same with outputs that are means: what is simulated.
     given_model : Model
         The model as it was given: before its starts were replaced, and its ties.
     records : tuple of Record
@@ -100,6 +104,7 @@ class Problem:
     """
 
     model: Model
+    averaged_model: Model
     given_model: Model
     records: tuple[Record, ...]
     settings: FitSettings
@@ -174,6 +179,7 @@ class Problem:
         ties = resolve_ties(model, all_parameters)
         tied = apply_ties(model, ties)
         check_delays(tied, all_parameters)
+        averaged = average_outputs(tied, records, settings.prediction)
         settings = split_weights(settings, tied, len(records))
         per_output = compute_output_weights(tied, records, settings.weights, settings.skip)
         experiments = tuple(
@@ -190,12 +196,13 @@ class Problem:
         )
         return cls(
             model=tied,
+            averaged_model=averaged,
             given_model=given,
             records=records,
             settings=settings,
             all_parameters=all_parameters,
             free_parameters=tuple(parameter for parameter in all_parameters if parameter.is_free),
-            evaluator=_build_evaluator(tied, experiments, all_parameters, settings),
+            evaluator=_build_evaluator(averaged, experiments, all_parameters, settings),
             experiments=experiments,
             output_weights=per_output,
             ties=ties,
@@ -247,7 +254,8 @@ class Problem:
     def __reduce__(self) -> _ReduceResult:
         if self.simulates_only:
             return build_simulation_problem, (self.given_model, self.records[0])
-        return Problem.from_settings, (self.given_model, self.records, self.settings)
+        records = tuple(replace(record, others=()) for record in self.records)
+        return Problem.from_settings, (self.given_model, records, self.settings)
 
     def share(self, key: str, compute: Callable[[], _Value]) -> _Value:
         """Return what does not depend on the values of the outputs, computed once for a sweep.
@@ -291,9 +299,13 @@ class Problem:
             )
         )
         evaluator = (
-            _replace_measured(self.evaluator, self.model, experiments, self._has_grid_samples)
+            _replace_measured(
+                self.evaluator, self.averaged_model, experiments, self._has_grid_samples
+            )
             if are_alike
-            else _build_evaluator(self.model, experiments, self.all_parameters, self.settings)
+            else _build_evaluator(
+                self.averaged_model, experiments, self.all_parameters, self.settings
+            )
         )
         return replace(
             self,
@@ -495,16 +507,18 @@ def _compute_channel_metrics(problem: Problem, simulated: FloatArray) -> list[Ch
 def build_simulation_problem(model: Model, record: Record) -> Problem:
     """Build a problem that only simulates: all parameters are fixed and nothing is compared."""
     weights = {output.name: 1.0 for output in model.outputs}
+    averaged = average_outputs(model, [record])
     experiment = place_on_grid(model, record, 0, model.parameters, weights, 0, simulates_only=True)
     settings = FitSettings(weights=weights)
     return Problem(
         model=model,
+        averaged_model=averaged,
         given_model=model,
         records=(record,),
         settings=settings,
         all_parameters=model.parameters,
         free_parameters=(),
-        evaluator=_build_evaluator(model, (experiment,), model.parameters, settings),
+        evaluator=_build_evaluator(averaged, (experiment,), model.parameters, settings),
         experiments=(experiment,),
         output_weights=weights,
         ties={},

@@ -12,7 +12,7 @@ from sysid.core.settings import (
     GeneticAlgorithm,
     Loss,
 )
-from sysid.data.records import HOLDS
+from sysid.data.holds import HOLDS, OUTPUT_HOLDS
 
 NAMES: Mapping[str, Sequence[str]] = {
     "method": SEARCH_METHODS,
@@ -20,6 +20,7 @@ NAMES: Mapping[str, Sequence[str]] = {
     "noise_model": NOISE_MODELS,
     "prediction": PREDICTION_KINDS,
     "hold": HOLDS,
+    "output_hold": OUTPUT_HOLDS[1:],
     "initial": INITIAL_SETTINGS,
 }
 """Names to choose from, by the field of the form."""
@@ -30,6 +31,7 @@ DEFAULTS: Mapping[str, str] = {
     "noise_model": Loss().noise_model,
     "prediction": FitSettings().prediction,
     "hold": "",
+    "output_hold": "",
     "initial": "",
 }
 """Preselected names; no hold and no start, since the recording and the model have one."""
@@ -48,6 +50,8 @@ TEXTS: Mapping[str, str] = {
     "measured": "first measured values (measured)",
     "zero": "held (zero)",
     "first": "straight line (first)",
+    "mean": "mean up to its time (mean)",
+    "mean-after": "mean from its time on (mean-after)",
 }
 """Texts of names; a name without a text is shown itself."""
 

@@ -211,7 +211,10 @@ function mapChannels(wanted = {}, held = readHolds()) {
     label.append(select);
     return label;
   });
-  document.getElementById('channels').replaceChildren(...choices, ...inputs.map((signal) => makeHoldChoice(signal, held[signal])));
+  document.getElementById('channels').replaceChildren(...choices, ...[...inputs, ...outputs].map((signal) => {
+    const template = inputs.includes(signal) ? 'holds' : 'output-holds';
+    return makeHoldChoice(signal, held[signal], template);
+  }));
   proposeBounds();
 }
 
@@ -227,19 +230,19 @@ async function proposeBounds() {
   if (proposals) showProposals(proposals);
 }
 
-/** Make the choice of an input's hold. A wrong hold moves a time lag by half a sample. */
-function makeHoldChoice(signal, hold) {
+/** Make the choice of a signal's hold. A wrong hold moves a time lag by half a sample. */
+function makeHoldChoice(signal, hold, template) {
   const label = makeElement('label', `${signal} between samples`);
   const select = document.createElement('select');
   select.dataset.hold = signal;
   select.dataset.pointer = `/hold/${signal}`;
-  select.append(document.getElementById('holds').content.cloneNode(true));
+  select.append(document.getElementById(template).content.cloneNode(true));
   select.value = hold ?? '';
   label.append(select);
   return label;
 }
 
-/** Read the holds that were chosen. Other inputs have the hold of the recording. */
+/** Read the holds that were chosen. Other signals have the hold of the recording. */
 const readHolds = () =>
   Object.fromEntries([...form.querySelectorAll('[data-hold]')].filter((select) => select.value).map((select) => [select.dataset.hold, select.value]));
 

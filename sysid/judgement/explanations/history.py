@@ -109,6 +109,7 @@ def _change_history(context: ResidualContext, name: str, reach: float, span: int
 
 
 def _prepend(channel: Channel, reach: float, span: int) -> Channel:
+    channel = channel.acting
     known = channel.history
     first = float(channel.times[0] if known is None else known.times[0])
     value = float(channel.values[0] if known is None else known.values[0])

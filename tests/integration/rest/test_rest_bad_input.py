@@ -45,7 +45,7 @@ JOBS: list[tuple[dict[str, Any], str, str]] = [
     ({"parameters": {"LL": {"upper": 1}}}, "/parameters/LL", "no parameter 'LL'"),
     ({"parameters": {"L": {"lower": 4, "upper": 1}}}, "/parameters/L", "[4, 1]"),
     ({"parameters": {"L": {"lower": -1}}}, "/parameters", "-1 s"),
-    ({"hold": {"y": "zero"}}, "/hold/y", "has no input 'y'"),
+    ({"hold": {"y": "zero"}}, "/hold/y", "need one of auto, mean"),
     ({"weights": {"z": 1}}, "/weights/z", "no output 'z'"),
     ({"weights": {"y": -1}}, "/weights/y", "found -1"),
     ({"skip": 300}, "/datasets/0", "300 samples"),

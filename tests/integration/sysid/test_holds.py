@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from sysid.core.errors import InvalidRecord
+from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.core.settings import GeneticAlgorithm, Stop
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold, Recording
@@ -14,6 +14,7 @@ from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
 from sysid.results.identification import Identification
 from sysid.results.parts import InputHold
+from sysid.simulation.simulate import simulate
 
 PERIOD, LAG = 0.5, 3.2
 
@@ -205,3 +206,54 @@ def test_the_validation_part_is_read_as_the_estimation_part() -> None:
 def test_the_hold_of_a_channel_that_is_not_there_is_refused() -> None:
     with pytest.raises(InvalidRecord, match="no channel 'v'"):
         step_test().replace_holds({"v": "zero"})
+
+
+FINE = 50
+
+
+def mean_test() -> tuple[FloatArray, FloatArray]:
+    """Means of input and output, (N,) each, over the periods that begin at the samples.
+
+    The input switches between two samples.
+    """
+    draw = np.random.default_rng(3)
+    lengths = draw.integers(3, 12, 60) * FINE + 17
+    levels = np.repeat(draw.uniform(-1.0, 1.0, 60), lengths)[: 200 * FINE]
+    step, x = PERIOD / FINE, np.zeros(200 * FINE + 1)
+    late = np.concatenate([np.full(round(LAG / step), levels[0]), levels])
+    x[0] = 1.5 * levels[0]
+    for k in range(200 * FINE):
+        x[k + 1] = 1.5 * late[k] + (x[k] - 1.5 * late[k]) * np.exp(-step / 8)
+    middle = 0.5 * (x[1:] + x[:-1])
+    noise = 0.01 * draw.standard_normal(200)
+    return levels.reshape(200, FINE).mean(axis=1), middle.reshape(200, FINE).mean(axis=1) + noise
+
+
+@pytest.mark.parametrize(("shift", "hold"), [(0.0, "mean-after"), (PERIOD, "mean")])
+def test_means_of_a_period_give_the_true_lag(shift: float, hold: Hold) -> None:
+    times = shift + PERIOD * np.arange(200)
+    u, y = (Channel(name, times, one) for name, one in zip("uy", mean_test(), strict=True))
+    found = identify_with_hold(Recording((u, y)), {"u": hold, "y": hold})
+    lag = next(one for one in found.parameters if one.name == "L")
+    assert lag.stderr is not None
+    assert lag.value == pytest.approx(LAG, abs=3 * lag.stderr + 0.01)
+    assert found.input_hold == (InputHold("u", hold, None),)
+    assert found.verdict.trust == "trustworthy"
+    values = identify_with_hold(Recording((u, y)), {"u": hold})
+    assert abs(build_lag(values) - LAG) == pytest.approx(0.5 * PERIOD, abs=0.1)
+
+
+def test_an_identified_model_reads_means_as_it_was_identified() -> None:
+    times = PERIOD * np.arange(200)
+    u, y = (Channel(name, times, one) for name, one in zip("uy", mean_test(), strict=True))
+    found = identify_with_hold(Recording((u, y)), {"u": "mean"})
+    answer = simulate(load_model("fopdt"), u, found)["y"].values
+    np.testing.assert_allclose(answer, found.simulated[0][0], atol=1e-9)
+
+
+def test_means_at_irregular_times_are_refused() -> None:
+    times = PERIOD * np.arange(200) ** 1.1
+    recording = Recording((Channel("u", times, mean_test()[0]), Channel("y", times, times)))
+    for name in "uy":
+        with pytest.raises(InvalidSettings, match=rf"/hold/{name}: .*irregular.*Resample it"):
+            identify_with_hold(recording, {name: "mean"})

@@ -508,7 +508,10 @@ ARGUMENTS = [
     ({"records": [pd.Series(T, T), pd.Series(T, T)]}, "one signal; model 'fopdt' has 2. Join"),
     ({"records": pd.DataFrame({"t": [], "u": [], "y": []})}, "the table has no rows"),
     ({"records": {"t": T[::-1], "u": T, "y": T}}, "decrease: sample 1 is at .*Sort the samples"),
-    ({"hold": {"uu": "zero"}}, "/hold/uu: model 'fopdt' has no input 'uu'; did you mean 'u'?"),
+    (
+        {"hold": {"uu": "zero"}},
+        "/hold/uu: model 'fopdt' has no input or output 'uu'; did you mean 'u'?",
+    ),
     ({"hold": {"u": "zoh"}}, "/hold/u: found 'zoh'; need one of auto, zero, first, band-limited"),
     ({"hold": "zero"}, "/hold: found 'zero'; need a mapping of inputs to holds"),
     ({"settings": "fast"}, "/settings: found 'fast'; need GeneticAlgorithm"),

@@ -56,6 +56,15 @@ def _change_plant(share: FloatArray, change: Callable[[Process], Process]) -> De
     return draw
 
 
+def _switch_early(plant: Process, seed: int) -> Record:
+    """Each change of the input comes up to a period before the sample that shows it."""
+    random, u = np.random.default_rng(seed), draw_levels(seed)
+    acting = hold(u)
+    for k in np.flatnonzero(np.diff(u)) + 1:
+        acting[FINE * k - random.integers(FINE) : FINE * k] = u[k]
+    return make_record(u, plant.respond(acting)[::FINE] + NOISE * draw_noise(seed))
+
+
 def _log_noise(plant: Process, seed: int) -> Record:
     """A smooth input whose record has noise that does not act."""
     white = np.random.default_rng([seed, 3]).standard_normal(N)
@@ -262,6 +271,7 @@ LOADS = (
 READING = (
     DefectCase("the input runs in lines", _interpolate, READINGS, QUICK),
     DefectCase("the output is a mean", _average_output, READINGS, QUICK),
+    DefectCase("the input switches between samples", _switch_early, ("switches between samples",)),
 )
 HISTORY = (
     DefectCase(
