@@ -1,6 +1,6 @@
 """Recordings: channels on their own times, segments, and records for a model."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from sysid.core.errors import InvalidRecord, suggest_name
 from sysid.core.text import append_unit
-from sysid.core.types import FloatArray
+from sysid.core.types import BoolArray, FloatArray
 from sysid.data.foreign_tables import (
     Column,
     Labelled,
@@ -864,3 +864,17 @@ def find_common_sample_time(records: Sequence[Record]) -> float | None:
     ) > _PERIOD_TOLERANCE * min(periods):
         return None
     return periods[0]
+
+
+def keep_outputs(records: Sequence[Record], select: Callable[[Channel], BoolArray]) -> list[Record]:
+    """Keep the samples of outputs that are selected; the others are missing then."""
+    return [
+        replace(
+            record,
+            outputs=tuple(
+                replace(one, values=np.where(select(one), one.values, np.nan))
+                for one in record.outputs
+            ),
+        )
+        for record in records
+    ]

@@ -19,7 +19,7 @@ from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE
 from sysid.kernels.signals.past_reads import is_difference
 from sysid.residuals.feedback import find_commands
 from sysid.residuals.residual_tests import list_residual_series
-from sysid.results.findings import Finding, Move, note
+from sysid.results.findings import Finding, Move, list_moves, note
 from sysid.results.parts import InputHold
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
@@ -137,14 +137,15 @@ def find_other_readings(
 
     That an input is read as straight lines is reported only where that is in doubt.
     """
+    known = {one.name: one for one in estimates}
     for hold, doubt in zip(holds, doubts, strict=True):
         evidence = _compute_evidence(hold, problem.n_scored, rms)
-        moves = _list_moves(hold, estimates)
+        moves = list_moves(estimates, hold.estimates_other or {}, {})
         notable = [move for move in moves if abs(move.stderrs) > NOTABLE_MOVE]
         if doubt or (notable and hold.chosen == "zero"):
             other = f"{_READINGS[str(hold.other)]} ({write_hold(hold)})"
             would = _describe_moves(notable, estimates) or "the same estimates"
-            outside = [move.parameter for move in notable if _is_outside(move, estimates)]
+            outside = [one.parameter for one in notable if known[one.parameter].excludes(one.value)]
             yield Finding(
                 "reading of an input",
                 "reading",
@@ -156,7 +157,7 @@ def find_other_readings(
                 if evidence > DEFECT_GAIN and _is_regular(hold.input, problem.records)
                 else "",
                 evidence,
-                tuple(moves),
+                moves,
                 tuple(outside) if doubt else (),
             )
         if hold.chosen == "zero" and hold.other is not None:
@@ -165,21 +166,6 @@ def find_other_readings(
 
 def _is_regular(name: str, records: Sequence[Record]) -> bool:
     return all(channel.sampling.is_regular for channel in _find_channels(name, records))
-
-
-def _list_moves(hold: InputHold, estimates: Sequence[Estimate]) -> list[Move]:
-    moves = []
-    for one in estimates:
-        other = (hold.estimates_other or {}).get(one.name)
-        if other is not None and one.stderr:
-            moves.append(Move(one.name, other, None, (other - one.value) / one.stderr))
-    return sorted(moves, key=lambda move: -abs(move.stderrs))
-
-
-def _is_outside(move: Move, estimates: Sequence[Estimate]) -> bool:
-    """Whether a move leaves the 95 % interval."""
-    interval = next(one.interval95 for one in estimates if one.name == move.parameter)
-    return interval is not None and not interval[0] <= move.value <= interval[1]
 
 
 def _describe_moves(moves: Sequence[Move], estimates: Sequence[Estimate]) -> str:

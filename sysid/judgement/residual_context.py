@@ -13,7 +13,7 @@ from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.core.units import format_unit
 from sysid.data.holds import Hold
 from sysid.data.interpolation import interpolate_channel
-from sysid.data.records import Channel, Record
+from sysid.data.records import Channel, Record, keep_outputs
 from sysid.judgement.residual_model import ColumnFit, OutputNoise, ResidualModel
 from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.kernels.signals.past_reads import is_difference, list_delayed_values
@@ -198,11 +198,8 @@ class ResidualContext:
         steps = _FINER * model.solver.substeps
         if is_difference(model) or steps > MAX_SUBSTEPS:
             return nothing
-        try:
-            added = self.simulate(model=replace_substeps(model, steps)) - self.simulation
-        except SysidError:
-            return nothing
-        return self.weight * added if np.all(np.isfinite(added)) else nothing
+        added = self.compute_effect(model=replace_substeps(model, steps))
+        return nothing if added is None else self.weight * added
 
     @cached_property
     def parameter_numbers(self) -> list[tuple[int, str]]:
@@ -356,21 +353,9 @@ class ResidualContext:
 
     def _select_span(self, begin: float, end: float) -> Problem:
         """Compare no outputs but those from a time up to another one (s), without it."""
-        records = [
-            replace(
-                record,
-                outputs=tuple(
-                    replace(
-                        one,
-                        values=np.where(
-                            (one.times >= begin) & (one.times < end), one.values, np.nan
-                        ),
-                    )
-                    for one in record.outputs
-                ),
-            )
-            for record in self.problem.records
-        ]
+        records = keep_outputs(
+            self.problem.records, lambda one: (one.times >= begin) & (one.times < end)
+        )
         return self.problem.rebuild(records=records, weights=self.problem.output_weights)
 
     @cached_property
@@ -405,6 +390,19 @@ class ResidualContext:
         """
         weights = self.problem.output_weights
         return self._predict(self.problem.rebuild(records=records, model=model, weights=weights))
+
+    def compute_effect(
+        self, records: Sequence[Record] | None = None, model: Model | None = None
+    ) -> FloatArray | None:
+        """Compute what other inputs or another model add to the simulated values (n,).
+
+        None if that is nothing, no number, or not to be simulated.
+        """
+        try:
+            added = self.simulate(records, model) - self.simulation
+        except SysidError:
+            return None
+        return added if np.all(np.isfinite(added)) and added.any() else None
 
     def replace_input(
         self, name: str, change: Callable[[FloatArray], FloatArray], hold: Hold | None = None
@@ -581,11 +579,6 @@ class ResidualContext:
         self.simulations.spent += 1
         values = problem.predict(self.theta[None])[0][problem.scored_rows]
         return np.asarray(values)
-
-    def name_part(self, part: ResidualPart) -> str:
-        """Name an output of an experiment."""
-        several = len(self.problem.records) > 1
-        return f"{part.output} of experiment {part.experiment + 1}" if several else part.output
 
     def iterate_outputs(self) -> Iterator[tuple[str, BoolArray, str]]:
         """Iterate over the outputs: name, rows (n,), unit."""

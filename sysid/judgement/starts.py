@@ -39,8 +39,8 @@ from sysid.minima.minima import scan_by_projection
 from sysid.models.model import Model
 from sysid.models.starts import compares_starts, replace_starts
 from sysid.noise_models.first_order_fit import fit_first_order_noise
-from sysid.residuals.series import is_coloured, iterate_parts
-from sysid.results.findings import Finding, Move
+from sysid.noise_models.generalised_least_squares import select_coloured_outputs
+from sysid.results.findings import Finding, Move, list_moves
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import is_at_bounds, to_unit
@@ -131,18 +131,7 @@ class StartComparison:
 
         Moves are those between the fits of this comparison, in the errors of the estimates.
         """
-        own = self.own.values
-        moves = [
-            Move(
-                one.name,
-                fit.values[one.name],
-                fit.stderrs.get(one.name),
-                (fit.values[one.name] - own[one.name]) / one.stderr,
-            )
-            for one in estimates
-            if one.stderr and one.name in fit.values and one.name in own
-        ]
-        return tuple(sorted(moves, key=lambda move: -abs(move.stderrs)))
+        return list_moves(estimates, fit.values, fit.stderrs, self.own.values)
 
 
 def _compute_gain(fit: FittedStart, other: FittedStart) -> float:
@@ -240,7 +229,8 @@ def compare_starts(
     if min(end.rms for _, _, end in known) <= SOLVER_SHARE * problem.output_scale:
         return None
     _, largest, end = max(known, key=lambda one: one[2].theta.size)
-    has_colour = problem.loss.noise_model == "ar1" or _has_coloured_residuals(largest, end.theta)
+    error = largest.compute_residuals(end.theta[None])[0]
+    has_colour = problem.loss.noise_model == "ar1" or bool(select_coloured_outputs(largest, error))
     fits = list[FittedStart]()
     for name, one, end in known:
         fit, count = _assess_start(name, one, end, steps, has_colour=has_colour)
@@ -356,11 +346,6 @@ def _is_lag_at_limit(fit: FittedStart) -> bool:
     delays = find_delay_parameters(fit.problem)
     pairs = zip(fit.problem.free_names, is_at_bounds(point)[1], strict=True)
     return any(at_upper for name, at_upper in pairs if name in delays)
-
-
-def _has_coloured_residuals(problem: Problem, theta: FloatArray) -> bool:
-    residuals = problem.compute_residuals(theta[None])[0]
-    return any(is_coloured(part, residuals[part.rows]) for part in iterate_parts(problem))
 
 
 def _assess_start(

@@ -22,9 +22,9 @@ import numpy as np
 
 from sysid.core.distributions import f_tail
 from sysid.core.errors import InvalidRecord
-from sysid.core.linear_algebra import compute_truncated_svd
-from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
+from sysid.core.types import BoolArray, FloatArray
 from sysid.data.records import Channel, Record
+from sysid.judgement.levels import UNLIKELY
 from sysid.kernels.signals.past_reads import list_delayed_values
 from sysid.language.functions import Interval
 from sysid.minima.minima import Fit, collect_minima, scan_parameters
@@ -38,7 +38,6 @@ from sysid.uncertainty.analysis import Analysis
 _MIN_SAMPLES_PER_PARAMETER = 2  # samples for each parameter, that are left
 _CONTRADICTION = 3.0  # mean square of samples that read assumed input, over that of the others
 _RELEASE = 1e6  # times their range
-_UNLIKELY = 1e-3  # probability of these residuals if the assumption holds
 _MAX_STEPS = 30  # of least squares, with as many simulations as there are parameters and one
 
 
@@ -232,13 +231,4 @@ def _is_contradicted(
     if variance <= 0:
         return bool(np.any(error != 0))
     ratio = float(np.mean(error**2)) / variance
-    return f_tail(count, degrees, ratio) < _UNLIKELY
-
-
-def compute_variances(columns: FloatArray) -> FloatArray:
-    """Compute the diagonal of (SᵀS)⁻¹, (D,); inf for parameters that these rows leave open."""
-    triangle = np.asarray(np.linalg.qr(columns, mode="r"))  # of a long record in half the time
-    _, singular, rows, retained = compute_truncated_svd(triangle)
-    variances: FloatArray = np.sum((rows[retained].T / singular[retained]) ** 2, axis=1)
-    is_open = np.max(np.abs(rows[~retained]), axis=0, initial=0.0) > RANK_TOLERANCE
-    return np.where(is_open, np.inf, variances)
+    return f_tail(count, degrees, ratio) < UNLIKELY

@@ -28,9 +28,10 @@ from sysid.judgement.input_hold import replace_holds, write_hold
 from sysid.judgement.residual_context import find_delay_parameters
 from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.minima.minima import scan_parameters
+from sysid.noise_models.generalised_least_squares import select_coloured_outputs
 from sysid.residuals.past_outputs import reads_outputs
-from sysid.residuals.series import is_coloured, iterate_parts
-from sysid.results.findings import Finding, Move
+from sysid.residuals.series import iterate_parts
+from sysid.results.findings import Finding, list_moves
 from sysid.results.parts import InputHold
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
@@ -106,19 +107,11 @@ def find_misled_run(
     """Find a free run that disturbances mislead, with the estimates of one step ahead."""
     if comparison is None:
         return
-    ahead = {one.name: one for one in comparison.estimates}
-    moves = [
-        Move(one.name, other.value, other.stderr, (other.value - one.value) / one.stderr)
-        for one in estimates
-        if (other := ahead.get(one.name)) is not None and one.stderr and one.is_free
-    ]
-    known = {one.name: one.interval95 for one in estimates}
-    outside = [
-        move.parameter
-        for move in moves
-        if (interval := known[move.parameter]) is not None
-        and not interval[0] <= move.value <= interval[1]
-    ]
+    ahead = {one.name: one.value for one in comparison.estimates}
+    stderrs = {one.name: one.stderr for one in comparison.estimates}
+    moves = list_moves([one for one in estimates if one.is_free], ahead, stderrs)
+    moved = {move.parameter for move in moves}
+    outside = [one.name for one in estimates if one.name in moved and one.excludes(ahead[one.name])]
     described = _describe(comparison.estimates, {one.name: one for one in estimates})
     yield Finding(
         "noise in the plant",
@@ -128,7 +121,7 @@ def find_misled_run(
         f"{comparison.cause}. So a free run attributes disturbances to the parameters. Predicted "
         f"one step ahead they are {described}.",
         f"Use {' and '.join(comparison.options)}.",
-        moves=tuple(sorted(moves, key=lambda move: -abs(move.stderrs))),
+        moves=moves,
         parameters=tuple(outside),
     )
 
@@ -163,8 +156,7 @@ def compute_growth(problem: Problem, theta: FloatArray) -> float:
 def _are_white(problem: Problem, analysis: Analysis) -> bool:
     if analysis.residuals_and_sensitivities is None or analysis.is_whitened:
         return False
-    error = analysis.residuals_and_sensitivities[0]
-    return not any(is_coloured(part, error[part.rows]) for part in iterate_parts(problem))
+    return not select_coloured_outputs(problem, analysis.residuals_and_sensitivities[0])
 
 
 def _describe(ahead: Sequence[Estimate], free: Mapping[str, Estimate]) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from sysid.core.errors import InvalidRecord
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
+from sysid.data.records import keep_outputs
 from sysid.residuals.residual_tests import ResidualTests, run_residual_tests
 from sysid.results.findings import Finding, note
 from sysid.search.refine import refine_candidates
@@ -106,23 +107,10 @@ def _estimate_starts(problem: Problem) -> FloatArray:
 
     So the rest is predicted. A record of which nothing is scored there is used as a whole.
     """
-    first = [
-        replace(
-            record,
-            outputs=tuple(
-                replace(
-                    channel,
-                    values=np.where(
-                        np.arange(channel.values.size) < _START_SHARE * channel.values.size,
-                        channel.values,
-                        np.nan,
-                    ),
-                )
-                for channel in record.outputs
-            ),
-        )
-        for record in problem.records
-    ]
+    first = keep_outputs(
+        problem.records,
+        lambda one: np.arange(one.values.size) < _START_SHARE * one.values.size,
+    )
     with suppress(InvalidRecord):  # nothing in it is scored
         problem = problem.rebuild(records=first, weights=problem.output_weights)
     middle = 0.5 * (problem.evaluator.lower + problem.evaluator.upper)

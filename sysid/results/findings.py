@@ -6,7 +6,7 @@ parameter. Statuses, verdict and warnings follow from the findings in one place,
 `sysid.judgement.conclusions`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -122,6 +122,31 @@ def note(explanation: str, family: Family, text: str) -> Finding:
     'note'
     """
     return Finding(explanation, family, "note", explanation, text)
+
+
+def list_moves(
+    estimates: Sequence[Estimate],
+    values: Mapping[str, float],
+    stderrs: Mapping[str, float | None],
+    own: Mapping[str, float] | None = None,
+) -> tuple[Move, ...]:
+    """List how far other values are from estimates that have an error, the furthest first.
+
+    They move from the `own` values, if these are not the estimates.
+
+    Examples
+    --------
+    >>> lag = Estimate("L", "s", 5.0, 0.0, 9.0, 0.5, (4.0, 6.0), "identified")
+    >>> list_moves([lag], {"L": 6.5}, {})
+    (Move(parameter='L', value=6.5, stderr=None, stderrs=3.0),)
+    """
+    own = {one.name: one.value for one in estimates} if own is None else own
+    moves = [
+        Move(name, values[name], stderrs.get(name), (values[name] - own[name]) / one.stderr)
+        for one in estimates
+        if (name := one.name) in values and name in own and one.stderr
+    ]
+    return tuple(sorted(moves, key=lambda move: -abs(move.stderrs)))
 
 
 def list_untold_reasons(estimates: Sequence[Estimate], findings: Sequence[Finding]) -> list[str]:

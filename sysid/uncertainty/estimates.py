@@ -78,6 +78,11 @@ class Estimate:
         """Whether another value is inside the bounds of the search."""
         return self.lower <= value <= self.upper
 
+    def excludes(self, value: float) -> bool:
+        """Whether another value is outside the 95 % interval; False without one."""
+        interval = self.interval95
+        return interval is not None and not interval[0] <= value <= interval[1]
+
 
 @dataclass(frozen=True, slots=True)
 class Criteria:

@@ -6,7 +6,6 @@ takes away (errors in variables: Söderström, Automatica 43 (2007) 939).
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -15,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
 from sysid.judgement.residual_context import Candidate, ResidualContext
@@ -49,12 +47,8 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             changes += _list_smoothings(name)
         for change in changes:
             records = context.replace_input(name, change.apply)
-            try:
-                other = context.simulate(records)
-            except SysidError:
-                continue
-            moved = other - context.simulation
-            if np.all(np.isfinite(moved)) and np.any(moved != 0):
+            moved = context.compute_effect(records)
+            if moved is not None:
                 yield Candidate(
                     change.explanation,
                     change.family,
@@ -89,20 +83,19 @@ def propose_loads(context: ResidualContext) -> Iterator[Candidate]:
         records[experiment] = _add_step(
             records[experiment], channel.name, begin, float(np.ptp(channel.values))
         )
-        with suppress(SysidError):
-            moved = context.simulate(records) - context.simulation
-            if np.all(np.isfinite(moved)) and moved.any():
-                moment = context.describe_moment(begin, experiment)
-                yield Candidate(
-                    "load",
-                    "input",
-                    context.weigh(moved),
-                    f"a load acts from about {moment} on",
-                    f"from about {moment} on a load acts on the plant beside {channel.name}, "
-                    "or another input",
-                    "Record the load as an input.",
-                    counted=1,
-                )
+        moved = context.compute_effect(records)
+        if moved is not None:
+            moment = context.describe_moment(begin, experiment)
+            yield Candidate(
+                "load",
+                "input",
+                context.weigh(moved),
+                f"a load acts from about {moment} on",
+                f"from about {moment} on a load acts on the plant beside {channel.name}, "
+                "or another input",
+                "Record the load as an input.",
+                counted=1,
+            )
 
 
 def _add_step(record: Record, name: str, begin: float, size: float) -> Record:

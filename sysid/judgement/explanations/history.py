@@ -7,12 +7,10 @@ outputs as columns.
 """
 
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
-from sysid.core.errors import SysidError
 from sysid.data.records import Channel, History, Record
 from sysid.judgement.residual_context import CUT_THERE, Candidate, ResidualContext
 from sysid.judgement.start_slopes import list_assumed_starts
@@ -76,12 +74,9 @@ def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:
     """Propose that an input was elsewhere before its first sample."""
     reach = compute_reach(context.problem, context.analysis)
     for name in context.inputs if reach > 0 else ():
-        columns = []
-        for span in range(_SPANS):
-            with suppress(SysidError):
-                other = context.simulate(_change_history(context, name, reach, span))
-                columns.append(other - context.simulation)
-        moved = [column for column in columns if np.all(np.isfinite(column)) and column.any()]
+        changed = (_change_history(context, name, reach, span) for span in range(_SPANS))
+        columns = [context.compute_effect(records) for records in changed]
+        moved = [column for column in columns if column is not None]
         if moved:
             yield Candidate(
                 "input before the record",

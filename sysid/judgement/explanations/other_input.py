@@ -14,10 +14,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.fft import irfft, rfft
 
-from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
+from sysid.judgement.explanations.structure import filter_signal
 from sysid.judgement.levels import DEFECT_GAIN, STRONG_ODDS
 from sysid.judgement.residual_context import (
     Candidate,
@@ -127,11 +126,7 @@ def _simulate_at_input(context: ResidualContext, name: str, at: str) -> FloatArr
                     hold=channel.effective_hold,
                 )
         records.append(replace(record, inputs=tuple(inputs)))
-    try:
-        moved = context.simulate(records) - context.simulation
-    except SysidError:
-        return None
-    return moved if np.all(np.isfinite(moved)) and moved.any() else None
+    return context.compute_effect(records)
 
 
 def _delay(context: ResidualContext, values: FloatArray) -> FloatArray:
@@ -146,17 +141,12 @@ def _delay(context: ResidualContext, values: FloatArray) -> FloatArray:
 
 
 def _filter(context: ResidualContext, columns: FloatArray, samples: float) -> FloatArray:
-    """Filter columns (n, q) by a time constant of some samples; each rests at its first value."""
+    """Filter columns (n, q) within each series by a time constant of some samples."""
     if not samples:
         return columns
     filtered = np.zeros(columns.shape)
     for part in context.parts:
-        values = columns[part.rows]
-        n = values.shape[0]
-        length = 1 << (2 * n - 1).bit_length()
-        decay = np.exp(-np.arange(n) / samples) * -np.expm1(-1.0 / samples)
-        moved = rfft(values - values[0], length, axis=0) * rfft(decay, length)[:, None]
-        filtered[part.rows] = irfft(moved, length, axis=0)[:n] + values[0]
+        filtered[part.rows] = filter_signal(columns[part.rows], samples)
     return filtered
 
 

@@ -6,11 +6,9 @@ reading) - ŷ.
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 
 import numpy as np
 
-from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 from sysid.judgement.residual_context import Candidate, ResidualContext
@@ -44,12 +42,8 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             if hold == "mean" and not is_regular:
                 continue
             records = context.replace_input(name, change, hold=hold)
-            try:
-                other = context.simulate(records)
-            except SysidError:
-                continue
-            moved = other - context.simulation
-            if np.all(np.isfinite(moved)) and moved.any():
+            moved = context.compute_effect(records)
+            if moved is not None:
                 is_sure = change is _keep and is_regular
                 setting = f"Use hold: {{{name}: {hold}}}." if is_sure else ""
                 yield Candidate(
@@ -79,19 +73,18 @@ def _propose_means(context: ResidualContext) -> Iterator[Candidate]:
         first, *others = names
         more = "".join(f", {name}: {hold}" for name in others)
         records = [record.replace_holds(holds) for record in context.problem.records]
-        with suppress(SysidError):
-            moved = context.simulate(records) - context.simulation
-            if np.all(np.isfinite(moved)):
-                yield Candidate(
-                    "mean of a period",
-                    "reading",
-                    context.weigh(moved),
-                    "the output is a mean",
-                    f"the output is the mean of the period that {word} at its stamp",
-                    f"Use hold: {{{first}: {hold}{more}}}.",
-                    records=records,
-                    is_whole=True,
-                )
+        moved = context.compute_effect(records)
+        if moved is not None:
+            yield Candidate(
+                "mean of a period",
+                "reading",
+                context.weigh(moved),
+                "the output is a mean",
+                f"the output is the mean of the period that {word} at its stamp",
+                f"Use hold: {{{first}: {hold}{more}}}.",
+                records=records,
+                is_whole=True,
+            )
 
 
 def _keep(values: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
         filtered = np.zeros(context.times.size)
         for part in context.parts:
             values = context.simulation[part.rows]
-            filtered[part.rows] = _filter(values, samples) - values
+            filtered[part.rows] = filter_signal(values, samples) - values
         yield Candidate(
             "one more time constant",
             "structure",
@@ -79,13 +79,13 @@ def _propose_dynamics(
     )
 
 
-def _filter(values: FloatArray, samples: float) -> FloatArray:
-    """Filter values (n,) by a time constant of some samples; they rest at their first one."""
-    n = values.size
+def filter_signal(values: FloatArray, samples: float) -> FloatArray:
+    """Filter values (n, …) by a time constant of some samples; they rest at their first one."""
+    n = values.shape[0]
     length = 1 << (2 * n - 1).bit_length()
     decay = np.exp(-np.arange(n) / samples) * -np.expm1(-1.0 / samples)
-    moved = irfft(rfft(values - values[0], length) * rfft(decay, length), length)[:n]
-    return np.asarray(moved + values[0])
+    spectra = rfft((values - values[0]).T, length) * rfft(decay, length)
+    return np.asarray(irfft(spectra, length)[..., :n].T + values[0])
 
 
 def _differentiate(context: ResidualContext) -> FloatArray:

@@ -130,7 +130,7 @@ def test_one_constant_output_of_two_is_a_caution() -> None:
 
 def explain_yardstick(*explanations: Finding, gain: float = 54.4) -> Finding:
     """Compare a model of 81 % with a linear one of 93 %, beside explanations of its residuals."""
-    yardstick = Yardstick("y", 4, {"u": 1.0}, 300, 93.2, 81.3, 0.07, 0.2, gain)
+    yardstick = Yardstick("y", 4, 300, 93.2, 81.3, 0.07, 0.2, gain)
     (found,) = find_better_yardstick(yardstick, ["K", "L"], explanations)
     return found
 

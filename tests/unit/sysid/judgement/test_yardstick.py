@@ -7,10 +7,6 @@ import pytest
 
 from sysid.data.records import Channel, Record
 from sysid.judgement import yardstick
-from sysid.judgement.input_grid import GridRows, average_input
-from sysid.judgement.left_out_blocks import leave_out_blocks
-from sysid.judgement.linear_fits import LinearFit
-from sysid.judgement.state_responses import compute_impulses
 from sysid.judgement.yardstick import Yardstick, fit_yardstick
 from sysid.models.catalogue.load import load_model
 from sysid.simulation.problem import Problem
@@ -62,7 +58,6 @@ def test_a_first_order_with_a_time_lag_is_found_against_a_model_without_one() ->
     u, _, y = record_first_order(1)
     found = compare(build(u, y), answer(u, 2.0, 18.0, 0))
     assert found.order == 1
-    assert found.delays["u"] == pytest.approx(7.0, abs=0.3)
     assert found.rms == pytest.approx(0.05, rel=0.1)
     assert found.is_clearly_better
 
@@ -117,7 +112,6 @@ def test_irregular_times_and_missing_samples_are_compared_where_they_are() -> No
     y[::7] = np.nan
     found = compare(build(u, y, times), np.zeros(700))
     assert found.samples == pytest.approx(0.9 * 600, abs=2)
-    assert found.delays["u"] == pytest.approx(7.0, abs=0.5)
     assert found.rms == pytest.approx(0.05, rel=0.3)
 
 
@@ -163,8 +157,6 @@ def test_each_output_is_explained_by_all_inputs() -> None:
     simulated = np.concatenate([answer(u, 1.0, 8.0, 3), answer(u, 1.0, 5.0, 0)])
     found = compare(problem, simulated)
     assert found.output == "y"
-    assert found.delays["u"] == pytest.approx(3.0, abs=0.5)
-    assert found.delays["v"] == pytest.approx(11.0, abs=0.5)
     assert found.rms == pytest.approx(0.05, rel=0.2)
 
 
@@ -178,7 +170,6 @@ def test_several_experiments_have_starts_of_their_own() -> None:
         records.append(Record(Channel("u", t, u, hold="zero"), Channel("y", t, y)))
         models.append(answer(u, 2.0, 12.0, 0))
     found = compare(Problem.build(load_model("fopdt"), records), np.concatenate(models))
-    assert found.delays["u"] == pytest.approx(7.0, abs=0.3)
     assert found.rms == pytest.approx(0.05, rel=0.2)
     assert found.is_clearly_better
 
@@ -191,7 +182,6 @@ def test_input_recorded_before_the_output_is_used() -> None:
     before = Channel("u", t, u, hold="zero").slice_with_history(100.0, 600.0)
     record = Record(before, Channel("y", t[100:], y[100:]))
     found = compare(Problem.build(load_model("fopdt"), [record]), np.zeros(500))
-    assert found.delays["u"] == pytest.approx(30.0, abs=0.3)
     assert found.rms == pytest.approx(0.02, rel=0.15)
 
 
@@ -201,7 +191,6 @@ def test_a_long_slow_record_is_averaged() -> None:
     y = answer(u, 2.0, 200.0, 90) + 0.1 * rng.standard_normal(6000)
     found = compare(build(u, y), np.zeros(6000))
     assert found.samples == 5400
-    assert found.delays["u"] == pytest.approx(90.0, abs=3.0)
     assert found.rms == pytest.approx(0.1, rel=0.05)
 
 
@@ -220,51 +209,6 @@ def test_one_step_alone_tells_nothing_of_the_block_that_holds_it() -> None:
     found = compare(build(u, y), answer(u, 2.0, 9.0, 0))
     assert found.samples < 540
     assert not found.is_clearly_better
-
-
-def test_impulse_responses_are_those_of_the_closed_forms() -> None:
-    rate, damping = 0.2, 0.3
-    [[first]] = compute_impulses(np.log([[rate]]), 50)
-    pole = np.exp(-rate)
-    np.testing.assert_allclose(first, (1 - pole) * pole ** np.arange(50), rtol=1e-10)
-    [second] = compute_impulses(np.log([[rate, damping]]), 50)
-    t = np.arange(51.0)
-    damped = rate * np.sqrt(1 - damping**2)
-    step = 1 - np.exp(-damping * rate * t) * (
-        np.cos(damped * t) + damping / np.sqrt(1 - damping**2) * np.sin(damped * t)
-    )
-    np.testing.assert_allclose(second[0], np.diff(step), atol=1e-10)
-    [chain] = compute_impulses(np.log([[rate, damping, 0.1]]), 2000)
-    assert np.sum(chain[2]) == pytest.approx(1.0)  # every section has gain 1
-
-
-def test_a_left_out_block_moves_linear_parameters_as_a_fit_without_it_does() -> None:
-    rng = np.random.default_rng(13)
-    columns, value = rng.standard_normal((120, 3)), rng.standard_normal(120)
-    best = np.linalg.lstsq(columns, value)[0]
-    errors = value - columns @ best
-    fit = LinearFit(np.zeros(1), np.zeros(1), 0.0, columns, np.zeros(3), errors)
-    block = np.concatenate([np.full(20, -1), np.repeat(np.arange(10), 10)])
-    ones = np.ones(120)
-    rows = GridRows(np.zeros(120, dtype=np.int64), np.arange(120.0), value, ones, block)
-    for number, left_out in enumerate(leave_out_blocks(fit, rows)):
-        np.testing.assert_array_equal(left_out.mask, block // 2 == number)
-        hidden = (block >= 0) & (block >= 2 * number - 1) & (block <= 2 * number + 2)
-        np.testing.assert_array_equal(left_out.seen, ~hidden)
-        seen = left_out.seen
-        without = np.linalg.lstsq(columns[seen], value[seen])[0]
-        np.testing.assert_allclose(left_out.move, without - best, atol=1e-10)
-        assert left_out.is_told
-
-
-def test_inputs_are_averaged_between_the_edges() -> None:
-    edges = np.array([-1.0, 0.0, 1.0, 1.5, 4.0])
-    held = Channel("u", [0.0, 1.0, 3.0], [2.0, 4.0, 0.0], hold="zero")
-    np.testing.assert_allclose(average_input(held, edges), [2.0, 2.0, 4.0, (1.5 * 4.0) / 2.5])
-    straight = Channel("u", [0.0, 1.0, 3.0], [2.0, 4.0, 0.0], hold="first")
-    np.testing.assert_allclose(
-        average_input(straight, edges), [2.0, 3.0, 3.5, 0.5 * 3.0 * 1.5 / 2.5]
-    )
 
 
 def test_coloured_residuals_count_as_fewer_samples() -> None:
