@@ -40,8 +40,8 @@ def differentiate(tree: Expression, state: str) -> Expression:
         case Unary(_, operand):
             return subtract(ZERO, differentiate(operand, state))
         case Binary(operator, left, right):
-            slopes = differentiate(left, state), differentiate(right, state)
-            return _differentiate_operation(operator, left, right, *slopes)
+            dleft, dright = differentiate(left, state), differentiate(right, state)
+            return _differentiate_operation(operator, left, right, dleft, dright)
         case FunctionCall(function, arguments):
             slopes = tuple(differentiate(argument, state) for argument in arguments[1:])
             if function == "where":

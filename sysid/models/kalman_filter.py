@@ -173,8 +173,9 @@ def _add_loads(model: Model, scales: NoiseScales) -> tuple[Model, dict[str, Expr
 def _list_loaded(model: Model) -> list[ModelSignal | Output]:
     """List the signals that the document names, or one input of those in the same equations."""
     if model.noise.load:
-        return [one for one in (*model.inputs, *model.outputs) if one.name in model.noise.load]
-    found: dict[tuple[int, ...], ModelSignal] = {}
+        signals: tuple[ModelSignal | Output, ...] = (*model.inputs, *model.outputs)
+        return [one for one in signals if one.name in model.noise.load]
+    found: dict[tuple[int, ...], ModelSignal | Output] = {}
     for signal in model.inputs:
         places = tuple(
             i

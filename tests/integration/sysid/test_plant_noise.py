@@ -1,6 +1,8 @@
 """Plants with noise inside them: a load, a drifting sensor, a loop, and an unstable plant."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,16 +10,19 @@ import pytest
 from sysid.core.settings import GeneticAlgorithm, Loss, Stop
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
+from sysid.export.export import export_model
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
+from sysid.results.identification import Identification
+from sysid.simulation.simulate import simulate
 
 PERIOD, GAIN, CONSTANT, LAG, SENSOR = 0.25, 2.0, 12.3, 4.25, 0.02
 TRUTH = {"K": GAIN, "T": CONSTANT, "L": LAG}
 QUICK = GeneticAlgorithm(population=32, stop=Stop(evaluations=20_000))
 
 
-def make_record(load: float, correlation: float, walk: float = 0.0, seed: int = 4) -> Record:
+def make_record(load: float, correlation: float, walk: float = 0.0, seed: int = 5) -> Record:
     """First order with a dead time of whole samples; a load at its input; its sensor may drift."""
     random, n = np.random.default_rng(seed), 600
     u = np.repeat(random.integers(0, 2, n // 40), 40) * 1.0
@@ -109,3 +114,20 @@ def test_an_unstable_plant_under_control_needs_no_free_run() -> None:
     for name, true in {"K": 1.0, "T": 8.0, "L": 1.0}.items():
         low, high = found[name].interval95 or (np.nan, np.nan)
         assert low <= true <= high, name
+
+
+def test_a_result_is_saved_exported_simulated_and_drawn(tmp_path: Path) -> None:
+    record = make_record(0.1, 20.0)
+    found = identify("fopdt", record, QUICK, loss=Loss(noise_model="load"))
+    found.save(tmp_path / "found.json")
+    assert Identification.load(tmp_path / "found.json") == found
+    exported = json.loads(export_model(load_model("fopdt"), found, "json"))
+    assert "load[u]" not in str(exported)
+    simulated = simulate("fopdt", record.inputs, found)["y"].values
+    free = simulated - record.outputs[0].values
+    assert found.plant_noise is not None
+    assert np.sqrt(np.mean(free**2)) == pytest.approx(found.plant_noise.rms_free, rel=0.05)
+    (band,) = found.compute_bands()
+    np.testing.assert_allclose(band.simulated, found.simulated[0][0])
+    (ahead,) = found.compute_bands(record.inputs)
+    np.testing.assert_allclose(ahead.simulated, simulated)
