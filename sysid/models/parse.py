@@ -227,7 +227,9 @@ def _read_noise(
     trees: tuple[Expression, ...],
     outputs: tuple[Output, ...],
 ) -> NoisePlaces:
-    if value is not None and scope.form != "differential":
+    if value is None:
+        return NoisePlaces()
+    if scope.form != "differential":
         detail = "belongs to the differential form; a recursion predicts from measured values"
         reader.add_fault("/noise", detail)
         return NoisePlaces()
