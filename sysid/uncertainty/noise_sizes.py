@@ -156,7 +156,7 @@ class _Lattice:
         points[:, self.sizes] += np.array(places, dtype=np.float64) @ self._axes
         inside = np.all((points >= 0.0) & (points <= 1.0), axis=1)
         points = np.clip(points, 0.0, 1.0)
-        fits: list[_Fit | None] = [None] * len(places)
+        fits: list[_LinearFit | None] = [None] * len(places)
         for _ in range(_ITERATIONS):
             for i, fit in enumerate(self._linearise(points)):
                 old = fits[i]
@@ -169,7 +169,7 @@ class _Lattice:
             for i, fit in enumerate(fits)
         ]
 
-    def _linearise(self, points: FloatArray) -> list["_Fit | None"]:
+    def _linearise(self, points: FloatArray) -> list["_LinearFit | None"]:
         """Fit the linear model of the residuals at points (Q, D), in their others."""
         count, p = len(points), self.others.size
         steps = np.where(points[:, self.others] < 0.5, _DIFFERENCE, -_DIFFERENCE)
@@ -182,7 +182,7 @@ class _Lattice:
             for q, start in enumerate(points[:, self.others])
         ]
 
-    def _make_point(self, point: FloatArray, fit: "_Fit") -> NoisePoint:
+    def _make_point(self, point: FloatArray, fit: "_LinearFit") -> NoisePoint:
         values = from_unit(self._problem.evaluator, point[None])[0]
         slopes = np.abs(self._measure_slopes(point)[self.others])
         return NoisePoint(
@@ -190,7 +190,7 @@ class _Lattice:
         )
 
 
-class _Fit(NamedTuple):
+class _LinearFit(NamedTuple):
     """Linear fit: least squares, most likely others (p,) with their errors, and the likelihood."""
 
     squares: float
@@ -199,7 +199,7 @@ class _Fit(NamedTuple):
     log_likelihood: float
 
 
-def _fit_linear(error: FloatArray, columns: FloatArray, start: FloatArray) -> _Fit | None:
+def _fit_linear(error: FloatArray, columns: FloatArray, start: FloatArray) -> _LinearFit | None:
     """Fit residuals (n,) by columns (n, p); None if they are not finite or of less than full rank.
 
     `squares` are those at the start itself, before the step.
@@ -217,4 +217,4 @@ def _fit_linear(error: FloatArray, columns: FloatArray, start: FloatArray) -> _F
     inverse = right.T / singular
     stderrs = np.sqrt(least / degrees * np.sum(np.square(inverse), axis=1))
     log_likelihood = -0.5 * degrees * np.log(least) - float(np.sum(np.log(singular)))
-    return _Fit(float(error @ error), start + step, stderrs, float(log_likelihood))
+    return _LinearFit(float(error @ error), start + step, stderrs, float(log_likelihood))

@@ -83,7 +83,7 @@ def _record(outputs: Sequence[str] = ("y",), missing: Sequence[int] = ()) -> Rec
     return Record((Channel("u", times, u, hold="zero"),), tuple(channels))
 
 
-def _lagged(substeps: int = 8, **fields: Any) -> dict[str, Any]:
+def _write_lagged(substeps: int = 8, **fields: Any) -> dict[str, Any]:
     return {
         "name": "lagged",
         "form": "differential",
@@ -120,7 +120,7 @@ def _list_lagged_steps(u: FloatArray) -> list[tuple[FloatArray, FloatArray, Floa
 @pytest.mark.parametrize("missing", [(), (3, 4, 5, 6, 30)])
 def test_a_load_behind_a_lag_has_its_exact_likelihood(missing: Sequence[int]) -> None:
     record = _record(missing=missing)
-    problem = Problem.build(parse_model(_lagged()), [record], loss=Loss(noise_model="load"))
+    problem = Problem.build(parse_model(_write_lagged()), [record], loss=Loss(noise_model="load"))
     theta = np.array([[GAIN, CONSTANT, LAG, LOAD, CORRELATION]])
     assert problem.free_names == ("K", "T", "L", "load[u]", "tau[u]")
 
@@ -144,7 +144,7 @@ def test_a_load_behind_a_lag_has_its_exact_likelihood(missing: Sequence[int]) ->
 
 
 def test_two_outputs_and_noise_in_two_states_have_their_exact_likelihood() -> None:
-    document = _lagged(
+    document = _write_lagged(
         states={"x": "1", "v": "1"},
         equations={"x": "(v - x)/T", "v": "(K*u(t) - v)/L"},
         outputs={"y": "x", "z": "x + v"},
@@ -181,12 +181,12 @@ def test_two_outputs_and_noise_in_two_states_have_their_exact_likelihood() -> No
 
 
 def test_the_drift_of_a_sensor_is_a_load_at_its_output() -> None:
-    document = _lagged(noise={"load": {"y": "estimate"}})
+    document = _write_lagged(noise={"load": {"y": "estimate"}})
     record = _record()
     problem = Problem.build(parse_model(document), [record])
     assert problem.free_names == ("K", "T", "L", "load[y]", "tau[y]")
     theta = np.array([[GAIN, CONSTANT, LAG, LOAD, CORRELATION]])
-    free = Problem.build(parse_model(_lagged()), [record]).predict(theta[:, :3])[0]
+    free = Problem.build(parse_model(_write_lagged()), [record]).predict(theta[:, :3])[0]
 
     decay = np.exp(-PERIOD / CORRELATION)
     step = (np.array([[decay]]), np.zeros(1), np.array([[LOAD**2 * (1 - decay**2)]]))
@@ -204,7 +204,7 @@ def test_the_drift_of_a_sensor_is_a_load_at_its_output() -> None:
 
 
 def test_a_document_names_the_places_of_noise() -> None:
-    document = _lagged(noise={"plant": {"x": "estimate"}, "load": {"u": "estimate"}})
+    document = _write_lagged(noise={"plant": {"x": "estimate"}, "load": {"u": "estimate"}})
     model = parse_model(document)
     assert model.document["noise"] == document["noise"]
     assert parse_model(model.document) == model
@@ -230,7 +230,7 @@ def test_a_document_names_the_places_of_noise() -> None:
     ],
 )
 def test_noise_without_a_place_is_a_fault(noise: object, pointer: str, text: str) -> None:
-    document = _lagged(
+    document = _write_lagged(
         noise=noise,
         inputs={"u": "1", "w": "1"} if "w" in pointer and "load" in pointer else {"u": "1"},
         states={"x": "1", "v": "1"},
@@ -270,7 +270,7 @@ def test_irregular_samples_are_refused_with_the_way_out() -> None:
     record = _record()
     irregular = Record(record.inputs, (Channel("y", times, np.sin(times)),))
     with pytest.raises(InvalidSettings, match="/solver/step"):
-        Problem.build(parse_model(_lagged()), [irregular], loss=Loss(noise_model="load"))
+        Problem.build(parse_model(_write_lagged()), [irregular], loss=Loss(noise_model="load"))
 
 
 def test_only_squares_and_no_other_predictions_go_with_noise_in_the_plant() -> None:
@@ -279,12 +279,14 @@ def test_only_squares_and_no_other_predictions_go_with_noise_in_the_plant() -> N
             Loss("soft-l1", noise_model=noise)  # type: ignore[arg-type]
         loss = Loss(noise_model=noise)  # type: ignore[arg-type]
         with pytest.raises(InvalidSettings, match="simulation"):
-            Problem.build(parse_model(_lagged()), [_record()], loss=loss, prediction="one-step")
+            Problem.build(
+                parse_model(_write_lagged()), [_record()], loss=loss, prediction="one-step"
+            )
 
 
 def test_an_individual_has_the_same_bits_alone_and_among_others() -> None:
     problem = Problem.build(
-        parse_model(_lagged()), [_record(missing=(3,))], loss=Loss(noise_model="load")
+        parse_model(_write_lagged()), [_record(missing=(3,))], loss=Loss(noise_model="load")
     )
     random = np.random.default_rng(3)
     lower = np.array([p.lower for p in problem.free_parameters])
