@@ -5,19 +5,16 @@ the likelihood has many poor minima, and is flat between them. The squares of a 
 basins. They are biased by the noise, but near enough for a start.
 """
 
-from collections.abc import Iterator, Mapping
-from itertools import product
-
 import numpy as np
 
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
 from sysid.identification.plant_noise import build_free_run
-from sysid.models.kalman_filter import is_noise_parameter
 from sysid.search.island import compute_start_budget, get_island_settings
 from sysid.search.refine import refine_candidates
 from sysid.selection.starts import SearchStarts
+from sysid.simulation.noise_levels import add_noise_levels
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit
 
@@ -26,7 +23,6 @@ _DRAWN, _REFINED = (
     256,
     16,
 )  # random points, and groups of them, of each of which the best is refined
-_LEVELS, _MOST_COMBINED = (0.3, 0.45, 0.6), 4  # of the range of each size of noise; such sizes
 
 
 def find_free_run_starts(problem: Problem, algorithm: GeneticAlgorithm, seed: int) -> SearchStarts:
@@ -43,20 +39,18 @@ def find_free_run_starts(problem: Problem, algorithm: GeneticAlgorithm, seed: in
         return SearchStarts()
     with use_one_thread():  # so that the last bit does not depend on the number of cores
         ends, spent = _search_free_runs(free, seed, most)
-        sizes = list(_list_sizes(problem))
-        found: list[tuple[float, int, Mapping[str, float]]] = []
+        found: list[tuple[float, int, FloatArray]] = []
         for number, end in enumerate(ends):
             plant = dict(zip(free.free_names, end.tolist(), strict=True))
-            starts = [{**plant, **one} for one in sizes]
-            theta = np.array([[start[name] for name in problem.free_names] for start in starts])
+            theta = add_noise_levels(problem, plant)
             fitness = problem.evaluate_fitness(theta)
+            spent += len(theta)
             best = int(np.argmin(fitness))
             if np.isfinite(fitness[best]):
-                found.append((float(fitness[best]), number, starts[best]))
-    return SearchStarts(
-        tuple(start for _, _, start in sorted(found, key=lambda one: one[:2])),
-        spent + len(ends) * len(sizes),
-    )
+                found.append((float(fitness[best]), number, theta[best]))
+    starts = [theta.tolist() for _, _, theta in sorted(found, key=lambda one: one[:2])]
+    names = problem.free_names
+    return SearchStarts(tuple(dict(zip(names, one, strict=True)) for one in starts), spent)
 
 
 def _search_free_runs(free: Problem, seed: int, most: int) -> tuple[list[FloatArray], int]:
@@ -73,16 +67,3 @@ def _search_free_runs(free: Problem, seed: int, most: int) -> tuple[list[FloatAr
     found = [one for one in refine_candidates(free, points, most - drawn) if one is not None]
     spent = drawn + len(points) + sum(one.evaluations for one in found)
     return [one.theta for one in found], spent
-
-
-def _list_sizes(problem: Problem) -> Iterator[Mapping[str, float]]:
-    """List choices of the sizes of noise: all combinations of levels, or of many one level."""
-    sizes = [p for p in problem.free_parameters if is_noise_parameter(p.name)]
-    rows = [i for i, name in enumerate(problem.free_names) if is_noise_parameter(name)]
-    is_few = len(sizes) <= _MOST_COMBINED
-    levels = product(_LEVELS, repeat=len(sizes) if is_few else 1)
-    for level in levels:
-        point = np.full((1, len(problem.free_names)), 0.5)
-        point[0, rows] = level if is_few else level[0]
-        values = from_unit(problem.evaluator, point)[0]
-        yield {problem.free_names[i]: float(values[i]) for i in rows}

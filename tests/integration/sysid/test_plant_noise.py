@@ -106,14 +106,21 @@ def test_an_unstable_plant_under_control_needs_no_free_run() -> None:
         "equations": {"x": "(x + K*u(t - L))/T"},
         "outputs": {"y": "x"},
         "initial": {"x": 0},
-        "noise": {"load": {"u": "estimate"}},
     }
     times = PERIOD * np.arange(n)
     record = Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
-    found = identify(parse_model(document), record, QUICK)
+    filtered = parse_model({**document, "noise": {"load": {"u": "estimate"}}})
+    found = identify(filtered, record, QUICK)
     for name, true in {"K": 1.0, "T": 8.0, "L": 1.0}.items():
         low, high = found[name].interval95 or (np.nan, np.nan)
         assert low <= true <= high, name
+    free = identify(parse_model(document), record)
+    (told,) = [one for one in free.findings if one.explanation == "noise in the plant"]
+    assert told.advice == "Use loss: {noise_model: load}."
+    moves = {move.parameter: move for move in told.moves}
+    for name, move in moves.items():
+        assert move.value == pytest.approx(found[name].value, abs=found[name].stderr)
+    assert any("Use loss=Loss(noise_model='load')" in text for text in free.warnings)
 
 
 def test_a_result_is_saved_exported_simulated_and_drawn(tmp_path: Path) -> None:
