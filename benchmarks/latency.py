@@ -1,4 +1,8 @@
-"""Measure how long a user waits: a job over REST, the whole command, a new model."""
+"""Measure how long a user waits: a job over REST, the whole command, a new model.
+
+What is said of an estimate is measured beside it: the search, the conclusion of a sweep's run, and
+the parts that a single run has more, each as a share of search and conclusion.
+"""
 
 import os
 import resource
@@ -6,14 +10,36 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from math import exp
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from scipy.signal import lfilter
 
 from benchmarks import paper_example
 from benchmarks.table import Row, parser, report
 from service.client.client import Client
 from service.client.embedded import run_embedded_service
 from sysid.core.code_cache import find_cache_folder
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.threads import use_one_thread
+from sysid.data.records import Channel, Record
+from sysid.identification.conclude import conclude_run
+from sysid.identification.run import advance_run, begin_run, is_finished
+from sysid.islands.run_state import RunState
+from sysid.judgement.judge import explain_residuals
+from sysid.judgement.process_order import compare_orders
+from sysid.judgement.residual_context import ResidualContext
+from sysid.judgement.starts import compare_starts
+from sysid.judgement.yardstick import fit_yardstick
+from sysid.models.catalogue.load import load_model
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import analyse_estimate
+
+_Value = TypeVar("_Value")
 
 POLL_SECONDS = 0.004
 """Between two looks at the job; half of it is in every figure."""
@@ -111,11 +137,91 @@ def never_seen(count: int) -> list[Row]:
     ]
 
 
+class Judged(NamedTuple):
+    """A first-order plant with a dead time, recorded under noise of some colour."""
+
+    name: str
+    samples: int
+    colour: float
+
+    def draw(self) -> Record:
+        """Draw the record, with levels of 8 samples."""
+        random, n = np.random.default_rng(self.samples), self.samples
+        u = np.repeat(random.uniform(-1.0, 1.0, n // 8 + 1), 8)[:n]
+        u[:8] = 0.0
+        late, decay = np.concatenate([np.zeros(5), u[:-5]]), exp(-0.1 / 1.5)
+        y = lfilter([0.0, 2.0 * (1.0 - decay)], [1.0, -decay], late)
+        y += lfilter([1.0], [1.0, -self.colour], random.normal(0.0, 0.03, n))
+        times = 0.1 * np.arange(n)
+        return Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
+
+
+JUDGED = (
+    Judged("300 samples, white", 300, 0.0),
+    Judged("2,000 samples, coloured", 2000, 0.9),
+    Judged("20,000 samples, coloured", 20_000, 0.9),
+)
+
+
+def judgement(count: int) -> list[Row]:
+    """Processor time of the judgement of an identification, part by part."""
+    rows = []
+    for one in JUDGED:
+        problem = Problem.build(load_model("fopdt"), [one.draw()])
+        spent = [_spend_on(problem, seed) for seed in range(count + 1)][1:]
+        plain = [each["search"] + each["conclusion of a sweep's run"] for each in spent]
+        for part in spent[0]:
+            shares = [each[part] / whole for each, whole in zip(spent, plain, strict=True)]
+            rows.append(Row(f"{one.name}: {part}", 100 * statistics.median(shares), "%"))
+        rows.append(Row(f"{one.name}: both", 1e3 * statistics.median(plain), "ms"))
+    return rows
+
+
+def _spend_on(problem: Problem, seed: int) -> dict[str, float]:
+    """Measure the processor time (s) of the steps of an identification."""
+    algorithm, spent = GeneticAlgorithm(), dict[str, float]()
+
+    def spend(part: str, work: Callable[[], _Value]) -> _Value:
+        start = time.process_time()
+        value = work()
+        spent[part] = time.process_time() - start
+        return value
+
+    state = spend("search", lambda: _search(problem, algorithm, seed))
+    swept = spend("conclusion of a sweep's run", lambda: conclude_run(problem, algorithm, state))
+    spend(
+        "conclusion of a single run", lambda: conclude_run(problem, algorithm, state, orders=True)
+    )
+    theta = np.array([swept[name].value for name in problem.free_names])
+    with use_one_thread():
+        analysis = analyse_estimate(problem, theta)
+        simulated = problem.predict(theta[None])[0]
+        context = ResidualContext(problem, theta, analysis)
+        spend("explanations of the residuals", lambda: explain_residuals(context))
+        spend("starts", lambda: compare_starts(problem, theta))
+        spend("orders", lambda: compare_orders(problem, theta, analysis.estimates))
+        spend("yardstick", lambda: fit_yardstick(problem, simulated))
+    return spent
+
+
+def _search(problem: Problem, algorithm: GeneticAlgorithm, seed: int) -> RunState:
+    state = begin_run(problem, algorithm, seed, None)
+    while not is_finished(algorithm, state):
+        state = advance_run(problem, algorithm, state, 1.0)
+    return state
+
+
 def main() -> None:
     """Measure and print."""
-    options = parser(__doc__ or "").parse_args()
+    arguments = parser(__doc__ or "")
+    arguments.add_argument("--judgement", action="store_true", help="nothing but the judgement")
+    options = arguments.parse_args()
     few = options.quick
-    rows = [*never_seen(3 if few else 7), *whole_command(3 if few else 9)]
+    judged = judgement(3 if few else 7)
+    if options.judgement:
+        report("Judgement", judged, [], options)
+        return
+    rows = [*judged, *never_seen(3 if few else 7), *whole_command(3 if few else 9)]
     report("Latency", [*rows, *over_rest(10 if few else 50)], [], options)
 
 

@@ -49,6 +49,13 @@ class FineInput:
     end: int
     max_delay: int
 
+    def is_placed_as(self, other: "FineInput") -> bool:
+        """Whether this input differs from another one in its values only."""
+        return self.values.size == other.values.size and all(
+            getattr(self, name) == getattr(other, name)
+            for name in ("start_index", "points_per_step", "begin", "end", "max_delay")
+        )
+
 
 def interpolate_input(
     channel: Channel,

@@ -33,7 +33,7 @@ from sysid.judgement.integration_step import (
     halve_step,
     mark_changing,
 )
-from sysid.judgement.judge import Explained, explain_residuals
+from sysid.judgement.judge import Explained, explain_if_noise, explain_residuals
 from sysid.judgement.residual_context import (
     ResidualContext,
     Simulations,
@@ -174,15 +174,19 @@ def find_best_estimate(
 ) -> BestEstimate:
     """Find the best estimate of a search that has ended, and analyse it.
 
-    Residuals are explained if that is asked for, or if a noise model depends on it.
-
     The integration step is halved until the estimates and their errors stand still, or until a
     limit is reached. Then those that still change are not identified, or have the change in their
-    errors. If the data decide where the states start, they do so before and after that. With
-    `explains`, intervals follow the profile likelihood where the linear model does not hold.
+    errors.
+
+    With `explains`, residuals are explained, and intervals follow the profile likelihood where the
+    linear model does not hold. If the data decide where the states start, they do so before and
+    after the steps are halved. Without it, a run of a sweep takes no longer. Starts are compared
+    if the setting asks for it, and residuals are explained if a noise model depends on it.
     """
     refines = is_refining(algorithm, len(state.islands))
-    search = _EstimateSearch(problem, state, budget, deadline, refines=refines)
+    search = _EstimateSearch(
+        problem, state, budget, deadline, refines=refines, compares_starts=explains
+    )
     search.choose_start()
     first: tuple[Estimate, ...] = ()
     limit = ""
@@ -244,12 +248,15 @@ class _EstimateSearch:
         deadline: Deadline,
         *,
         refines: bool,
+        compares_starts: bool,
     ) -> None:
         self.problem, self.state, self._budget = problem, state, budget
         self._initial = problem.settings.initial
         self._left: list[StartKind | None] = []
         self.starts: StartComparison | None = None
         self._deadline, self._refines = deadline, refines
+        is_asked = compares_starts or self._initial == "auto"
+        self._compares_starts = refines and is_asked
         self._reserved = compute_analysis_budget(len(state.islands[0].point))
         self._work = compute_work_limit(problem, state.evaluations)
         self._scanned: FloatArray | None = None
@@ -320,7 +327,7 @@ class _EstimateSearch:
 
         A start that was left is not taken again.
         """
-        if not self._refines:
+        if not self._compares_starts:
             return False
         self._choose_best()
         if self._is_start_compared():
@@ -415,7 +422,7 @@ class _EstimateSearch:
         left = self._budget.count_left(self._reserved)
         simulations = Simulations(left, self._deadline.is_past_grace)
         context = ResidualContext(self.problem, self.theta, self.analysis, simulations)
-        explained = explain_residuals(context)
+        explained = explain_residuals(context) if explains else explain_if_noise(context)
         self._budget.spend(simulations.spent)
         return explained
 

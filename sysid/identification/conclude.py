@@ -50,7 +50,7 @@ from sysid.judgement.preparation import (
     find_useless_prediction,
 )
 from sysid.judgement.process_order import compare_orders, find_other_orders
-from sysid.judgement.residual_context import find_delay_parameters
+from sysid.judgement.residual_context import Simulations, find_delay_parameters
 from sysid.judgement.settling import find_rough_end, find_unsettled
 from sysid.judgement.starts import StartComparison, find_open_starts
 from sysid.judgement.unrecorded_input import find_unrecorded_input
@@ -191,13 +191,18 @@ def _build_identification(
     measures = compares_orders and not is_white and not feedback
     yardstick = fit_yardstick(problem, simulated) if measures else None
     is_of_the_solver = metrics.rms <= SOLVER_SHARE * problem.output_scale
-    explanations = select_explanations(
-        () if is_of_the_solver or feedback else explained.findings,
-        [
-            *find_other_orders(orders, problem.model.name, estimates),
-            *find_other_readings(problem, holds, doubts, estimates, rms),
-            *find_open_starts(best.starts, estimates),
-        ],
+    simulations = Simulations(budget.count_left(), deadline.is_past_grace)
+    explanations = (
+        ()
+        if feedback
+        else select_explanations(
+            () if is_of_the_solver else explained.findings,
+            [
+                *find_other_orders(orders, problem.model.name, estimates),
+                *find_other_readings(problem, holds, doubts, estimates, rms, simulations),
+                *find_open_starts(best.starts, estimates),
+            ],
+        )
     )
     findings = order_findings(
         [
@@ -219,7 +224,9 @@ def _build_identification(
             *find_open_terms(estimates, problem.model),
             *find_undetermined(problem, analysis, delays, are_residuals_noise=are_noise),
             *find_early_responses(problem),
-            *find_unrecorded_input(problem, analysis, is_contradicted=minima.is_contradicted),
+            *find_unrecorded_input(
+                problem, analysis, explanations, is_contradicted=minima.is_contradicted
+            ),
             *(() if is_of_the_solver else find_unexplained(tests, explained, analysis)),
             *feedback,
             *find_unit_faults(problem),
@@ -254,6 +261,7 @@ def _build_identification(
         ],
         problem.n_scored,
     )
+    budget.spend(simulations.spent)
     analysis = replace(analysis, estimates=conclude_estimates(estimates, findings))
     declared = [parameter.name for parameter in problem.given_model.parameters]
     fit = FitPercent(

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
 from sysid.identification.fit_problems import FitRecords, ProblemPair
@@ -35,9 +36,10 @@ def collect_fitted_data(
     series = list_residual_series(
         tested, _join_outputs(tested, simulated), result.correlation_times
     )
-    correlations = compute_correlations(
-        [one._replace(coefficients=counts.get(one.output, 0)) for one in series]
-    )
+    with use_one_thread():  # more of them spend more time, and change the last bit
+        correlations = compute_correlations(
+            [one._replace(coefficients=counts.get(one.output, 0)) for one in series]
+        )
     return FittedData(
         model,
         tuple(_select_signals(model, record) for record in records.estimation),

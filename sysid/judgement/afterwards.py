@@ -1,7 +1,7 @@
 """Explain the residuals of a result that was concluded without it, such as that of a sweep's run.
 
 A sweep concludes many runs, of which few are looked at. So their residuals are explained when
-somebody does, from the stored estimate.
+somebody does, from the stored estimate. Then starts are compared too: another one is a finding.
 """
 
 from dataclasses import replace
@@ -19,6 +19,7 @@ from sysid.judgement.judge import Explained, explain_residuals, select_explanati
 from sysid.judgement.levels import SOLVER_SHARE
 from sysid.judgement.noise_findings import find_unexplained
 from sysid.judgement.residual_context import ResidualContext
+from sysid.judgement.starts import compare_starts, find_open_starts
 from sysid.results.result import Result
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
@@ -37,6 +38,7 @@ def explain_afterwards(problem: Problem, result: Result) -> Result:
     with use_one_thread():
         analysis = analyse_estimate(problem, theta)
         explained = explain_residuals(ResidualContext(problem, theta, analysis))
+        starts = compare_starts(problem, theta, problem.settings.initial)
     if not explained.is_done:
         return result
     tests = result.residual_tests
@@ -44,7 +46,8 @@ def explain_afterwards(problem: Problem, result: Result) -> Result:
     still = list(find_unexplained(tests, explained, analysis))
     answered = [one for one in find_unexplained(tests, Explained(), analysis) if one not in still]
     kept = [one for one in result.findings if one not in answered]
-    compared = [one for one in kept if one.gain is not None]
+    compared = [one for one in kept if one.gain is not None and one.family != "start"]
+    compared += find_open_starts(starts, result.parameters)
     findings = order_findings(
         [
             *(one for one in kept if one.gain is None),

@@ -32,8 +32,11 @@ _OF_RECORD = (
     "constant output",
     "constant input",
     "exchanged channels",
+    "feedback",
 )  # then nothing else says anything
 _FAILURES = ("constant", "little fit", "straight line")
+_LACKS = ("no information", "combination", "bound", "other minimum", "no time lag")
+"""What the data do not tell. What is known of the record, and of its noise, may be why."""
 _RANKS: tuple[EstimateStatus, ...] = (
     "identified",
     "dependent",
@@ -47,9 +50,11 @@ _RANKS: tuple[EstimateStatus, ...] = (
 def order_findings(findings: Iterable[Finding], samples: float = 0.0) -> tuple[Finding, ...]:
     """Order findings: explanations with a clear gain, then what is severe, then notes.
 
-    Explanations of what the model leaves come before those of its noise. If the model fails, one
-    that takes less than half of the residuals' variance, of so many samples, is not why. Within
-    each group the largest gain is first; what is not compared follows in its order.
+    Explanations of what the model leaves come before those of its noise. A cause comes before what
+    follows from it: how the record was made and what its noise is like before what it does not
+    tell. If the model fails, an explanation that takes less than half of the residuals' variance,
+    of so many samples, is not why. Within each group the largest gain is first; what is not
+    compared follows in its order.
     """
     listed = list(findings)
     fails = any(one.severity == "serious" and one.explanation in _FAILURES for one in listed)
@@ -62,11 +67,19 @@ def order_findings(findings: Iterable[Finding], samples: float = 0.0) -> tuple[F
 
 
 def _find_group(finding: Finding, least: float) -> int:
-    if finding.explanation in _OF_RECORD:
-        return -1
-    if finding.gain is not None and finding.gain > least and not finding.is_of_noise:
-        return 0
-    return 1 + _SEVERITIES.index(finding.severity)
+    """Find the group of a finding: its place in this list."""
+    is_clear = finding.gain is not None and finding.gain > least
+    is_lack = finding.explanation in _LACKS and finding.severity == "caution"
+    groups = (
+        finding.explanation in _OF_RECORD,
+        is_clear and not finding.is_of_noise,
+        finding.severity == "serious",
+        finding.severity == "caution" and not is_lack,
+        is_clear,
+        is_lack,
+        True,
+    )
+    return groups.index(True)
 
 
 def conclude_estimates(
@@ -168,13 +181,14 @@ def conclude_verdict(
 def _list_causes(first: Finding, severe: Sequence[Finding]) -> list[str]:
     """List the briefs that a verdict names: the likeliest cause of doubt, and one more.
 
-    That is the most severe one, then a note that explains the data better, then the next.
+    That is the most severe one, then a note that explains the data better, then the next. That the
+    model fails is named once.
     """
-    worst = min(severe, key=lambda one: _SEVERITIES.index(one.severity))
+    failures = [one for one in severe if one.explanation in _FAILURES]
+    told = [one for one in severe if one not in failures[1:]]
+    worst = min(told, key=lambda one: _SEVERITIES.index(one.severity))
     notes = [first] if first.severity == "note" else []
-    return list(dict.fromkeys(one.brief for one in (severe[0], worst, *notes, *severe)))[
-        :_MOST_REASONS
-    ]
+    return list(dict.fromkeys(one.brief for one in (told[0], worst, *notes, *told)))[:_MOST_REASONS]
 
 
 def add_reading_notes(found: "Identification", texts: Sequence[str]) -> "Identification":

@@ -61,7 +61,7 @@ def _find_bounds(
     if not bounded and not analysis.active_bounds:
         return
     active = analysis.active_bounds
-    names = [one.name for one in bounded] or [bound.name for bound in active]
+    names = [bound.name for bound in active] or [one.name for one in bounded]
     lies = "lies at its bound" if len(names) == 1 else "lie at their bounds"
     texts = [str(bound) for bound in active]
     listed = {bound.name for bound in active}
@@ -79,7 +79,7 @@ def _find_bounds(
         f"To widen: {cures}, unless it is a physical limit."
         if cures
         else "Widen the range, unless it is a physical limit.",
-        parameters=tuple(names),
+        parameters=tuple(one.name for one in bounded) or tuple(names),
         status="at bound",
     )
 

@@ -15,7 +15,9 @@ import numpy as np
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 from sysid.data.records import Channel, Record
+from sysid.judgement.judge import leaves_noise
 from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE
+from sysid.judgement.residual_context import Simulations
 from sysid.kernels.signals.past_reads import is_difference
 from sysid.residuals.feedback import find_commands
 from sysid.residuals.residual_tests import list_residual_series
@@ -132,10 +134,12 @@ def find_other_readings(
     doubts: Sequence[str],
     estimates: Sequence[Estimate],
     rms: float,
+    simulations: Simulations,
 ) -> Iterator[Finding]:
     """Find holds chosen by the data where the other reading is as likely, or moves an estimate.
 
-    That an input is read as straight lines is reported only where that is in doubt.
+    That an input is read as straight lines is reported only where that is in doubt. The other
+    reading is advised if it leaves nothing but noise, as far as simulations allow to tell.
     """
     known = {one.name: one for one in estimates}
     for hold, doubt in zip(holds, doubts, strict=True):
@@ -154,7 +158,7 @@ def find_other_readings(
                 f"input {hold.input!r} {hold.reason}, so it is read {_READINGS[hold.chosen]}. Read "
                 f"{other} it would give {would}.{f' {doubt}.' if doubt else ''}",
                 f"Use {write_hold(hold)}."
-                if evidence > DEFECT_GAIN and _is_regular(hold.input, problem.records)
+                if evidence > DEFECT_GAIN and _is_cure(problem, hold, simulations)
                 else "",
                 evidence,
                 moves,
@@ -164,8 +168,13 @@ def find_other_readings(
             yield from _find_uncertain_jumps(hold.input, problem.records)
 
 
-def _is_regular(name: str, records: Sequence[Record]) -> bool:
-    return all(channel.sampling.is_regular for channel in _find_channels(name, records))
+def _is_cure(problem: Problem, hold: InputHold, simulations: Simulations) -> bool:
+    """Whether an input is sampled regularly, and its other reading leaves nothing but noise."""
+    channels = _find_channels(hold.input, problem.records)
+    if not all(one.sampling.is_regular for one in channels) or not hold.estimates_other:
+        return False
+    start = np.array([hold.estimates_other[name] for name in problem.free_names])
+    return leaves_noise(replace_holds(problem, [hold]), start, simulations)
 
 
 def _describe_moves(moves: Sequence[Move], estimates: Sequence[Estimate]) -> str:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.core.distributions import chi_square_limit
+from sysid.core.errors import SysidError
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.judgement.explanations import (
@@ -31,14 +32,23 @@ from sysid.judgement.levels import (
     STRONG_ODDS,
     UNLIKELY_MOVE,
 )
-from sysid.judgement.residual_context import CUT_THERE, Candidate, ResidualContext
+from sysid.judgement.residual_context import (
+    CUT_THERE,
+    Candidate,
+    ResidualContext,
+    Simulations,
+)
 from sysid.judgement.residual_model import ColumnFit
 from sysid.kernels.signals.past_reads import is_difference
 from sysid.results.findings import Finding, Move
+from sysid.search.refine import refine_candidates
+from sysid.simulation.problem import Problem
+from sysid.simulation.start_values import convert_point
+from sysid.uncertainty.analysis import analyse_estimate
 
+_FREE_PROPOSERS = (constancy.propose, sensor.propose)
 _PROPOSERS = (
-    constancy.propose,
-    sensor.propose,
+    *_FREE_PROPOSERS,
     structure.propose,
     history.propose,
     reading.propose,
@@ -48,11 +58,13 @@ _COSTLY_PROPOSERS = (actuator.propose, actuator.propose_loads, switches.propose)
 """Each of their explanations takes a simulation: only if the residuals depend on anything."""
 _LIKELY = 0.01  # of the ratio of one candidate: then the costly ones are looked at as well
 _BY_ORDER = ("one more time constant", "filter of a sensor")  # another order is the full fit
+_SETTABLE = ("order", "reading of an input", "start")  # their advice is a setting
 _MOST_SHARE = 0.5  # columns for a sample: with 0.8, noise gains 12 in one of 20 records of 30
 _MOST_FINDINGS = 3  # that are found beside each other
 _MOST_TOLD = 3  # moves in a sentence
 _MOST_RIVALS = 2  # in a sentence
 _MOST_REFITTED = 6  # explanations that are fitted in full
+_FULL_FIT = 30  # steps of least squares of a setting that is tried
 
 
 class _Scored(NamedTuple):
@@ -77,7 +89,12 @@ class Explained(NamedTuple):
 
     @property
     def is_noise(self) -> bool:
-        """Whether no explanation has strong odds against noise alone, or moves an estimate."""
+        """Whether no explanation but those of noise has strong odds against it."""
+        return self.is_sound and all(one.is_of_noise for one in self.findings)
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether no explanation moves an estimate, and none was left out."""
         is_clear = self.is_done and not self.is_doubtful
         return is_clear and all(one.severity == "note" for one in self.findings)
 
@@ -86,16 +103,41 @@ def explain_residuals(context: ResidualContext) -> Explained:
     """Explain the residuals of an estimate by the likeliest explanations, the largest gain first.
 
     The likeliest one is taken, then the likeliest beside it, as long as one gains clearly
-    (stepwise by Schwarz's criterion). One that is taken twice, such as a limit at two levels, is
-    told once. If no simulations are left for some explanations, it is not done.
+    (stepwise by Schwarz's criterion). Beside another it gains no more than that. One that is taken
+    twice, such as a limit at two levels, is told once. If no simulations are left for some
+    explanations, it is not done. Settings that it advises are tried.
     """
-    if not (_is_possible(context) and np.all(np.isfinite(context.simulation))):
+    if not _is_possible(context):
         return Explained(is_doubtful=context.simulations.is_cut_short)
+    return _explain(context, _score_at_once(context), advises=True)
+
+
+def explain_if_noise(context: ResidualContext) -> Explained:
+    """Explain the residuals as far as it takes to tell whether nothing but noise is left.
+
+    If an explanation that takes no simulation has strong odds and moves an estimate, it is not
+    done: the others would have to explain more and move nothing. No setting is advised.
+    """
+    if not _is_possible(context):
+        return Explained()
+    scored = _score_at_once(context)
+    is_likely = bool(scored) and scored[0].gain > STRONG_ODDS
+    if is_likely and _describe(context, scored[0], None, ()).parameters:
+        return Explained(is_doubtful=True)
+    return _explain(context, scored, advises=False)
+
+
+def _score_at_once(context: ResidualContext) -> list[_Scored]:
+    """Score the explanations that take few simulations or none."""
+    criterion = context.residual_model.without.criterion
+    return _score(context, list(_list_candidates(context, _PROPOSERS)), [], 0, criterion)
+
+
+def _explain(context: ResidualContext, scored: list[_Scored], *, advises: bool) -> Explained:
+    """Explain residuals, beginning with the explanations that are scored already."""
     base = context.residual_model.without
     before: ColumnFit | None = None
-    taken, counted = np.zeros((context.times.size, 0)), 0
-    candidates = list(_list_candidates(context, _PROPOSERS))
-    scored = _score(context, candidates, taken, counted, base.criterion)
+    taken, counted = list[FloatArray](), 0
     if base.is_coloured or any(_is_likely(one, context.times.size) for one in scored):
         costly = list(_list_candidates(context, _COSTLY_PROPOSERS))
         scored += _score(context, costly, taken, counted, base.criterion)
@@ -113,19 +155,33 @@ def explain_residuals(context: ResidualContext) -> Explained:
             and one.candidate.explanation != best.candidate.explanation
         ]
         if all(one.brief != best.candidate.brief for one in findings):
-            findings.append(_describe(context, best, before, rivals))
+            found = _describe(context, best, before, rivals)
+            is_tried = advises and not rivals
+            findings.append(_try_setting(context, best.candidate, found) if is_tried else found)
         if best.moves is not None:
             break  # the estimate is another one then
-        taken = np.hstack([taken, best.candidate.columns])
+        taken.append(best.candidate.columns)
         counted += best.candidate.counted
         base = before = best.fit
-        candidates = [one.candidate for one in scored if one.gain > DEFECT_GAIN][1:]
-        scored = _score(context, candidates, taken, counted, base.criterion)
+        candidates = _propose_beside(
+            context.take(np.hstack(taken)), [one.candidate for one in scored[1:]]
+        )
+        scored = [
+            one._replace(gain=min(one.gain, best.gain))
+            for one in _score(context, candidates, taken, counted, base.criterion)
+        ]
     findings += find_noise(context, base)
     if not findings:
         findings += find_disagreement_of_frequencies(context)
     is_cut_short = context.simulations.is_cut_short
     return Explained(tuple(findings), not is_cut_short, is_doubtful or is_cut_short)
+
+
+def _propose_beside(beside: ResidualContext, others: Sequence[Candidate]) -> list[Candidate]:
+    """Propose anew what takes no simulation, such as other moments of a change; keep the rest."""
+    anew = list(_list_candidates(beside, _FREE_PROPOSERS))
+    names = {one.explanation for one in anew}
+    return [*anew, *(one for one in others if one.explanation not in names)]
 
 
 def _is_possible(context: ResidualContext) -> bool:
@@ -139,7 +195,9 @@ def _is_possible(context: ResidualContext) -> bool:
         return False  # its first samples are predicted from an assumed past, which looks like more
     if any(part.repeats is not None for part in context.parts):
         return False  # samples of a repeat share their noise, which is no series in time
-    return bool(np.any(error)) and error.size > 2 * columns.shape[1] + 10
+    if not (np.any(error) and error.size > 2 * columns.shape[1] + 10):
+        return False
+    return bool(np.all(np.isfinite(context.simulation)))
 
 
 def _is_likely(scored: _Scored, samples: int) -> bool:
@@ -171,18 +229,16 @@ def _have_lengths(columns: FloatArray) -> bool:
 def _score(
     context: ResidualContext,
     candidates: Sequence[Candidate],
-    taken: FloatArray,
+    taken: Sequence[FloatArray],
     counted: int,
     criterion: float,
 ) -> list[_Scored]:
     """Score candidates beside the columns (n, t) that are taken, the largest gain first."""
-    scored = []
-    for candidate in candidates:
-        fit = context.residual_model.fit(
-            np.hstack([taken, candidate.columns]), counted + candidate.counted
-        )
-        scored.append(_Scored(candidate, fit, criterion - fit.criterion))
-    return _order(scored)
+    fits = context.residual_model.fit_each(
+        [one.columns for one in candidates], [counted + one.counted for one in candidates], taken
+    )
+    pairs = zip(candidates, fits, strict=True)
+    return _order([_Scored(one, fit, criterion - fit.criterion) for one, fit in pairs])
 
 
 def _order(scored: Sequence[_Scored]) -> list[_Scored]:
@@ -193,7 +249,7 @@ def _order(scored: Sequence[_Scored]) -> list[_Scored]:
 def _refit_finalists(
     context: ResidualContext, scored: Sequence[_Scored], criterion: float
 ) -> list[_Scored]:
-    """Fit in full the likeliest explanations of which each is another record.
+    """Fit in full the likeliest explanations of which each is another record or start.
 
     They may move the parameters by far more than a linear step. Of a whole other record, the full
     fit counts: a column may be scaled, and then says something else.
@@ -203,13 +259,14 @@ def _refit_finalists(
         name = one.candidate.text if one.candidate.is_whole else one.candidate.explanation
         if len(tried) == _MOST_REFITTED or one.gain <= 0.0:
             break
-        if one.candidate.records is None or name in tried:
+        if name in tried or not one.candidate.is_refitted:
             continue
         tried[name] = position
-        found = context.refit(one.candidate.records)
+        found = context.refit(one.candidate.change)
         if found is None:
             continue
-        used = (1 + one.candidate.counted) * np.log(max(context.times.size, 2))
+        added = one.candidate.columns.shape[1] + one.candidate.counted
+        used = added * np.log(max(context.times.size, 2))
         gain = float(criterion - found.criterion - used)
         if one.candidate.is_whole:
             refitted[position] = one._replace(gain=gain, moves=found.moves)
@@ -281,11 +338,48 @@ def _describe(
         "caution" if parameters else "note",
         candidate.brief,
         text,
-        candidate.advice if parameters or candidate.family == "start" else "",
+        candidate.advice if parameters else "",
         best.gain,
         moves,
         parameters,
     )
+
+
+def _try_setting(context: ResidualContext, candidate: Candidate, finding: Finding) -> Finding:
+    """Advise the setting of an explanation if nothing but noise is left with it.
+
+    One that moves nothing needs no setting, but for the start: its errors are too small.
+    """
+    if not candidate.setting or (finding.severity == "note" and candidate.family != "start"):
+        return finding
+    problem, changes = context.problem, candidate.change
+    try:
+        other = problem.rebuild(**{"weights": problem.output_weights, **changes})
+    except SysidError:
+        return finding
+    start = convert_point(problem, other, context.theta)
+    if not leaves_noise(other, start, context.simulations):
+        return finding
+    return replace(finding, advice=f"{finding.advice} {candidate.setting}".lstrip())
+
+
+def leaves_noise(problem: Problem, start: FloatArray, simulations: Simulations) -> bool:
+    """Fit a problem in full from a start (D,), and judge whether nothing is left that moves it.
+
+    That is what makes an alternative of an explanation: only then its estimates are better. False
+    if simulations do not suffice, or if an estimate ends at a bound.
+    """
+    if not simulations.allow(2 * _FULL_FIT * (start.size + 1)):
+        return False
+    (end,) = refine_candidates(problem, [start], _FULL_FIT * (start.size + 1), simulations.is_late)
+    if end is None:
+        return False
+    analysis = analyse_estimate(problem, end.theta)
+    simulations.spent += end.evaluations + analysis.evaluations
+    if any(one.status == "at bound" for one in analysis.estimates):
+        return False
+    context = ResidualContext(problem, end.theta, analysis, simulations)
+    return explain_if_noise(context).is_sound
 
 
 def _is_large(context: ResidualContext, best: _Scored) -> bool:
@@ -321,7 +415,8 @@ def select_explanations(
     Each of them was compared with the model alone, so they compete. Those with strong evidence
     against them, beside the likeliest one, are left out. What was found beside the likeliest one
     stays with it. Another order that was fitted in full takes the place of its columns.
-    Explanations of the noise compete with none of them, and always stay.
+    Explanations of the noise compete with none of them, and always stay. A setting is advised only
+    if nothing competes with it.
     """
     if any(one.explanation == "order" and (one.gain or 0.0) > DEFECT_GAIN for one in refitted):
         explained = [one for one in explained if one.explanation not in _BY_ORDER]
@@ -332,5 +427,20 @@ def select_explanations(
     other = max((one.gain or 0.0 for one in refitted), default=0.0)
     kept = [one for one in refitted if one.gain is None or (one.gain or 0.0) > first - STRONG_ODDS]
     if other - first > STRONG_ODDS:
-        return (*of_noise, *kept)
-    return (*explained, *kept)
+        return (*of_noise, *_leave_out_rival_settings(kept))
+    return _leave_out_rival_settings([*explained, *kept])
+
+
+def _leave_out_rival_settings(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Leave out the settings of findings that others, without strong evidence, compete with."""
+    gains = [(one.explanation, one.gain) for one in findings if not one.is_of_noise]
+    return tuple(
+        replace(one, advice="")
+        if one.explanation in _SETTABLE
+        and any(
+            name != one.explanation and gain is not None and gain > (one.gain or 0.0) - STRONG_ODDS
+            for name, gain in gains
+        )
+        else one
+        for one in findings
+    )

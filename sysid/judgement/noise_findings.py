@@ -85,8 +85,12 @@ def find_unexplained(
             "structure",
             "caution",
             f"the residuals depend on {names}",
-            f"the residuals on the {tests.data} data depend on {names}: a part of the response is "
-            "missing from the model, or it does not hold there.",
+            f"the residuals on the {tests.data} data depend on {names}: "
+            + (
+                "the model does not hold there, or its estimates are not exact enough for them."
+                if tests.data == "validation"
+                else "a part of the response is missing from the model."
+            ),
         )
     elif failed and not explained.is_done:
         yield Finding(
@@ -96,13 +100,18 @@ def find_unexplained(
             "the residuals are not noise",
             f"the residuals on the {tests.data} data are not white, and why was not looked for.",
         )
-    uncertainty = analysis.uncertainty
-    if uncertainty is not None and uncertainty.noise_colour in ("coloured", "drifting"):
-        is_drifting = uncertainty.noise_colour == "drifting"
+    colour = "" if analysis.uncertainty is None else analysis.uncertainty.noise_colour
+    if colour == "drifting":
+        yield Finding(
+            "coloured noise",
+            "noise",
+            "caution",
+            "the residuals drift over the whole record",
+            "the residuals drift over the whole record, so the standard errors are too small.",
+        )
+    elif colour == "coloured":
         yield note(
             "coloured noise",
             "noise",
-            "the residuals drift over the whole record, so the standard errors are too small"
-            if is_drifting
-            else "the noise is coloured, and the standard errors allow for it",
+            "the noise is coloured, and the standard errors allow for it",
         )

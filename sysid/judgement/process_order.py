@@ -14,6 +14,12 @@ The criterion is Schwarz's (BIC, 1978), as for all explanations (`sysid.judgemen
 each order has noise of its own, an autoregression that is estimated with it. An order is preferred
 if its BIC is 6 lower than that of every other: odds of 20 to 1 (Kass and Raftery 1995: strong
 evidence). Orders within 6 of the lowest are open, and the dead time lies in the range of theirs.
+
+An open order makes the dead time doubtful if it is at least as likely as the model's own. Its part
+belongs to the model then (median probability model: Barbieri and Berger, Ann. Statist. 32 (2004)
+870). A less likely one is a note. So a true model is doubted only if a likelihood ratio exceeds
+ln n by chance. The new part is at its bound 0 then, and that has a probability of ½ P(χ²₁ > ln n):
+0.7 % with 400 samples (Self and Liang, J. Am. Stat. Assoc. 82 (1987) 605).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -29,7 +35,7 @@ from sysid.core.settings import FitSettings, Loss, StartKind
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
-from sysid.judgement.judge import explain_residuals
+from sysid.judgement.judge import explain_if_noise
 from sysid.judgement.levels import SEPARABLE, UNLIKELY_MOVE
 from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
 from sysid.models.catalogue.load import load_model
@@ -148,8 +154,14 @@ def compare_orders(
 def _judge_fit(
     comparison: OrderComparison, model: str, context: ResidualContext
 ) -> OrderComparison:
-    """Judge whether nothing but noise is left by the fit of a model."""
-    leaves_noise = explain_residuals(context).is_noise
+    """Judge whether the fit of a model tells all its parameters, and leaves nothing but noise.
+
+    Time constants that end as equals, in a group, are those of a model with still more of them.
+    """
+    leaves_noise = (
+        all(one.status == "identified" for one in context.analysis.estimates if one.is_free)
+        and explain_if_noise(context).is_sound
+    )
     fits = tuple(
         replace(fit, leaves_noise=leaves_noise) if fit.model == model else fit
         for fit in comparison.fits
@@ -162,8 +174,9 @@ def find_other_orders(
 ) -> Iterator[Finding]:
     """Find orders that the data prefer, or do not rule out, and that move the dead time.
 
-    Those that count move it by more than its interval. Another order is advised if nothing but
-    noise is left by it. `model` is the name of the model that was identified.
+    Those that count move it by more than its interval, and are as likely as the model. A larger
+    order is advised if it leaves nothing but noise, and if both tell the dead time. `model` is the
+    name of the model that was identified.
     """
     if comparison is None or comparison.preferred_model == comparison.model:
         return
@@ -174,6 +187,7 @@ def find_other_orders(
     moved = [fit for fit in others if _is_moved(fit, own)]
     if comparison.preferred_model is None and not moved:
         return
+    is_doubt = any(fit.bic <= own.bic for fit in moved)
     listed = ", ".join(_write_delay(comparison, fit) for fit in others)
     instead = f"instead of {estimate.value:.4g}{plain_unit(estimate.unit)}"
     if comparison.preferred_model is None:
@@ -188,12 +202,12 @@ def find_other_orders(
             f"{name} is {listed} {instead}."
         )
         cure = "Give your model as many time constants, or use" if model != own.model else "Use"
-        is_cure = best.leaves_noise and best.order > own.order
+        is_cure = best.leaves_noise and best.order > own.order and estimate.status == "identified"
         advice = f"{cure} the model {best.model}." if is_cure else ""
     yield Finding(
         "order",
         "structure",
-        "caution" if moved else "note",
+        "caution" if is_doubt else "note",
         brief,
         text,
         advice,
@@ -203,7 +217,7 @@ def find_other_orders(
             for fit in sorted(moved, key=lambda fit: fit.bic)
             if estimate.stderr
         ),
-        (name, *_list_moved(best, estimates, name)) if moved else (),
+        (name, *_list_moved(best, estimates, name)) if is_doubt else (),
     )
 
 

@@ -1,9 +1,10 @@
 """What explanations of residuals start from: residuals, sensitivities, and the model itself."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,15 +15,17 @@ from sysid.core.units import format_unit
 from sysid.data.holds import Hold
 from sysid.data.interpolation import interpolate_channel
 from sysid.data.records import Channel, Record, keep_outputs
-from sysid.judgement.residual_model import ColumnFit, OutputNoise, ResidualModel
+from sysid.judgement.lagged_products import OutputNoise
+from sysid.judgement.residual_model import ColumnFit, ResidualModel
 from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.kernels.signals.past_reads import is_difference, list_delayed_values
-from sysid.models.model import MAX_SUBSTEPS, Model, replace_substeps
+from sysid.models.model import MAX_SUBSTEPS, replace_substeps
 from sysid.models.ties import collect_parameter_names
 from sysid.residuals.series import ResidualPart, iterate_parts
 from sysid.results.findings import Family, Move
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
+from sysid.simulation.start_values import convert_point
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale
 from sysid.uncertainty.sensitivities import compute_sensitivities
 
@@ -61,10 +64,9 @@ class Candidate:
         coefficient that is added to it.
     moment : float or None
         Where something changes, s.
-    records : sequence of Record, or None
-        Records with which the model is fitted again, for moves that are not linear.
     is_whole : bool
-        Whether these records are all that it says, as another reading is: not a share of them.
+        Whether the records that it changes are all that it says, as another reading is: not a share
+        of them.
     doubtful : collection of str
         Parameters that take its place in the model, whatever the step to it: a time lag that of
         missing parts, and of clocks.
@@ -72,6 +74,11 @@ class Candidate:
         Whether it leaves open what the model lacks: then no parameter is safe.
     is_added : bool
         Whether it adds to the output whatever the parameters are, such as a drift of the sensor.
+    setting : str
+        Advice that is a setting: told after it was tried.
+    change : mapping of str to object
+        What it changes in the problem, as `Problem.rebuild` takes it. The model is fitted again so
+        before a setting is told, and for moves that are not linear.
     """
 
     explanation: str
@@ -84,11 +91,17 @@ class Candidate:
     describe: Callable[[ColumnFit], str] | None = None
     varies: tuple[int, float, float] | None = None
     moment: float | None = None
-    records: Sequence[Record] | None = None
     is_whole: bool = False
     doubtful: Collection[str] = ()
     is_vague: bool = False
     is_added: bool = False
+    setting: str = ""
+    change: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_refitted(self) -> bool:
+        """Whether it can be fitted in full, to the same samples."""
+        return bool(self.change) and "skip" not in self.change
 
 
 @dataclass(eq=False)
@@ -190,6 +203,14 @@ class ResidualContext:
         exact = ResidualModel(-error - self._integration_error, columns, self.parts)
         return min(exact, plain, key=lambda model: model.without.criterion)
 
+    def take(self, columns: FloatArray) -> "ResidualContext":
+        """Return the context beside columns (n, q), as if they were those of parameters."""
+        other, model = copy(self), self.residual_model
+        joined = np.hstack([model.columns, columns])
+        vars(other)["residual_model"] = ResidualModel(model.residuals, joined, self.parts)
+        vars(other).pop("_bases", None)
+        return other
+
     @cached_property
     def _integration_error(self) -> FloatArray:
         """What a finer step adds to the weighted outputs (n,)."""
@@ -198,8 +219,14 @@ class ResidualContext:
         steps = _FINER * model.solver.substeps
         if is_difference(model) or steps > MAX_SUBSTEPS:
             return nothing
-        added = self.compute_effect(model=replace_substeps(model, steps))
-        return nothing if added is None else self.weight * added
+        try:
+            finer = self.problem.rebuild(
+                model=replace_substeps(model, steps), weights=self.problem.output_weights
+            )
+        except SysidError:
+            return nothing
+        added = self._predict(finer) - self.simulation
+        return self.weight * added if np.all(np.isfinite(added)) else nothing
 
     @cached_property
     def parameter_numbers(self) -> list[tuple[int, str]]:
@@ -266,26 +293,28 @@ class ResidualContext:
             return error
         return error * self.move_value(number, move) / float(self.theta[number])
 
-    def refit(self, records: Sequence[Record]) -> "Refitted | None":
-        """Fit the model again to other records; None if that fails."""
+    def refit(self, change: Mapping[str, Any]) -> "Refitted | None":
+        """Fit the model again after a change of the problem; None if that fails."""
         if not self.simulations.allow(_FULL_FIT * (self.theta.size + 1)):
             return None
-        problem = self.problem.rebuild(records=records, weights=self.problem.output_weights)
-        (end,) = refine_candidates(problem, [self.theta], _REFIT_STEPS * (self.theta.size + 1))
+        problem = self.problem.rebuild(**{"weights": self.problem.output_weights, **change})
+        start = convert_point(self.problem, problem, self.theta)
+        (end,) = refine_candidates(problem, [start], _REFIT_STEPS * (start.size + 1))
         if end is None:
             return None
         sensitivities = compute_sensitivities(problem, end.theta)
         self.simulations.spent += end.evaluations + sensitivities.evaluations
         fit = ResidualModel(-sensitivities.residuals, sensitivities.columns, self.parts).without
         scale = compute_physical_scale(problem, end.theta)
-        values = end.theta + fit.coefficients * scale
+        values = dict(zip(problem.free_names, end.theta + fit.coefficients * scale, strict=True))
+        errors = dict(zip(problem.free_names, fit.errors * scale, strict=True))
         known = {estimate.name: estimate for estimate in self.analysis.estimates}
         moves = _order_moves(
             Move(
                 name,
-                float(values[number]),
-                float(fit.errors[number] * scale[number]),
-                float(values[number] - self.theta[number]) / stderr,
+                float(values[name]),
+                float(errors[name]),
+                float(values[name] - self.theta[number]) / stderr,
             )
             for number, name in self.parameter_numbers
             if (stderr := known[name].stderr)
@@ -381,25 +410,24 @@ class ResidualContext:
                 shifted[part.rows.start + first : part.rows.stop] = slope[part.rows][:length]
         return shifted
 
-    def simulate(
-        self, records: Sequence[Record] | None = None, model: Model | None = None
-    ) -> FloatArray:
-        """Simulate the scored values (n,) with other inputs or another model.
+    def simulate(self, records: Sequence[Record]) -> FloatArray:
+        """Simulate the scored values (n,) with other inputs, or outputs that are means.
 
         They are ``nan`` if no more simulations are allowed.
         """
+        pairs = zip(self.problem.records, records, strict=True)
+        if all(_differ_in_inputs_only(before, after) for before, after in pairs):
+            return self._predict(self.problem.replace_inputs(records))
         weights = self.problem.output_weights
-        return self._predict(self.problem.rebuild(records=records, model=model, weights=weights))
+        return self._predict(self.problem.rebuild(records=records, weights=weights))
 
-    def compute_effect(
-        self, records: Sequence[Record] | None = None, model: Model | None = None
-    ) -> FloatArray | None:
-        """Compute what other inputs or another model add to the simulated values (n,).
+    def compute_effect(self, records: Sequence[Record]) -> FloatArray | None:
+        """Compute what other inputs add to the simulated values (n,), as `simulate` has them.
 
         None if that is nothing, no number, or not to be simulated.
         """
         try:
-            added = self.simulate(records, model) - self.simulation
+            added = self.simulate(records) - self.simulation
         except SysidError:
             return None
         return added if np.all(np.isfinite(added)) and added.any() else None
@@ -610,6 +638,13 @@ def interpolate_known(channel: Channel, times: FloatArray) -> FloatArray:
             channel, times=channel.times[known], values=channel.values[known], repeats=None
         )
     return interpolate_channel(channel, times)
+
+
+def _differ_in_inputs_only(before: Record, after: Record) -> bool:
+    """Whether records have the same outputs, and inputs that begin at the same times."""
+    if any(one is not other for one, other in zip(before.outputs, after.outputs, strict=True)):
+        return False
+    return [one.times[0] for one in before.inputs] == [one.times[0] for one in after.inputs]
 
 
 class Refitted(NamedTuple):

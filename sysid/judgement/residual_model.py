@@ -11,15 +11,21 @@ estimated in turn, by generalised least squares (Cochrane and Orcutt 1949).
 
 is the difference of Schwarz's criteria (Ann. Statist. 6 (1978) 461): twice the logarithm of the
 odds (Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773). No simulation is needed.
+
+All of that follows from products of the columns at a few lags, as in the covariance method of
+linear prediction (Makhoul, Proc. IEEE 63 (1975) 561). So a record is read once for all
+explanations. The rest is linear algebra of small matrices, of many explanations at a time.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from itertools import groupby
 
 import numpy as np
 
 from sysid.core.types import FloatArray
+from sysid.judgement.lagged_products import Autoregressions, LaggedProducts, OutputNoise
 from sysid.residuals.series import ResidualPart
 
 _MOST_ORDER = 6  # of the autoregression of an output's noise
@@ -28,32 +34,14 @@ _LENGTH_PER_ORDER = 2  # samples at least, of a series that tells of the noise
 _ROUNDS = 2  # of generalised least squares and noise model, in turn
 _RIDGE = 1e-10  # of columns of length 1: only a column that others hold is kept from dividing by 0
 _LEAST_VARIANCE = 1e-20  # of the residuals: less is rounding
+_MOST_NUMBERS = 1 << 20  # of columns, and of products, of explanations that are fitted at a time
+
+_Fitted = tuple[float, FloatArray, FloatArray, tuple[OutputNoise, ...]]
+"""What a fit finds: Schwarz's criterion without its penalty, coefficients, errors, noise."""
 
 
-class OutputNoise(NamedTuple):
-    """Noise of an output: an autoregression (p,), its variance and that of its innovations."""
-
-    weights: FloatArray
-    variance: float
-    innovation_variance: float
-
-    def whiten(self, values: FloatArray) -> FloatArray:
-        """Whiten values (n,) or (n, k) of one series, in deviations of the noise.
-
-        The first p keep their correlation, and their variance is that of the noise.
-        """
-        first = min(self.weights.size, values.shape[0])
-        filtered = values / np.sqrt(self.innovation_variance)
-        if first:
-            for lag, weight in enumerate(self.weights.tolist(), 1):
-                filtered[first:] -= (weight / np.sqrt(self.innovation_variance)) * values[
-                    first - lag : values.shape[0] - lag
-                ]
-            filtered[:first] = values[:first] / np.sqrt(self.variance)
-        return np.asarray(filtered)
-
-
-class ColumnFit(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class ColumnFit:
     """Columns fitted to residuals.
 
     Attributes
@@ -65,20 +53,28 @@ class ColumnFit(NamedTuple):
         Their standard errors.
     noise : tuple of OutputNoise
         Of each output.
-    innovations : FloatArray, shape (n,)
-        Of the noise, in its deviations.
+    model : ResidualModel
+    added : tuple of FloatArray, shapes (n, q)
+        Columns beside those of the parameters.
     """
 
     criterion: float
     coefficients: FloatArray
     errors: FloatArray
     noise: tuple[OutputNoise, ...]
-    innovations: FloatArray
+    model: "ResidualModel"
+    added: tuple[FloatArray, ...]
 
     @property
     def is_coloured(self) -> bool:
         """Whether some output's noise is coloured."""
         return any(one.weights.size for one in self.noise)
+
+    @cached_property
+    def innovations(self) -> FloatArray:
+        """Innovations (n,) of the noise, in its deviations."""
+        design = np.hstack([self.model.columns, *self.added])
+        return self.model.whiten(self.model.residuals - design @ self.coefficients, self.noise)
 
 
 class ResidualModel:
@@ -103,36 +99,71 @@ class ResidualModel:
 
     def fit(self, columns: FloatArray, counted: int = 0) -> ColumnFit:
         """Fit columns (n, q) beside those of the parameters; `counted` more count as parameters."""
-        design = np.hstack([self.columns, columns])
-        length = np.linalg.norm(design, axis=0)
-        scale = np.where(length > 0, length, 1.0)
-        joint = np.column_stack([design / scale, self.residuals])
-        k = joint.shape[1] - 1
-        coefficients = _solve(joint.T @ joint)
+        [found] = self.fit_each([columns], [counted])
+        return found
+
+    def fit_each(
+        self,
+        explanations: Sequence[FloatArray],
+        counted: Sequence[int],
+        taken: Sequence[FloatArray] = (),
+    ) -> list[ColumnFit]:
+        """Fit the columns (n, q) of each explanation by itself, beside those that are `taken`.
+
+        Parameters
+        ----------
+        explanations : sequence of FloatArray, shapes (n, q)
+        counted : sequence of int
+            Parameters of each beside its columns; those of what is taken are among them.
+        taken : sequence of FloatArray, shapes (n, t)
+        """
+        own = np.column_stack([self.columns, *taken]).T
+        fits = dict[int, ColumnFit]()
+        by_width = sorted(range(len(explanations)), key=lambda i: explanations[i].shape[1])
+        for q, numbers in groupby(by_width, key=lambda i: explanations[i].shape[1]):
+            alike = list(numbers)
+            pairs = ((_MOST_ORDER + 1) * (1 + len(own) + q)) ** 2
+            most = max(_MOST_NUMBERS // max(q * self.residuals.size, pairs), 1)
+            for chosen in (alike[i : i + most] for i in range(0, len(alike), most)):
+                found = self._fit_alike(own, np.stack([explanations[i].T for i in chosen]))
+                for i, (twice, coefficients, errors, noise) in zip(chosen, found, strict=True):
+                    added = (*taken, explanations[i])
+                    used = sum(one.shape[1] for one in added) + counted[i]
+                    used += sum(one.weights.size for one in noise)
+                    criterion = float(twice + used * np.log(max(self.residuals.size, 2)))
+                    fits[i] = ColumnFit(criterion, coefficients, errors, noise, self, added)
+        return [fits[i] for i in range(len(explanations))]
+
+    def _fit_alike(self, own: FloatArray, added: FloatArray) -> Iterable[_Fitted]:
+        """Fit `added` columns (B, q, n) beside `own` ones (s, n), for each of B explanations."""
+        b, n = added.shape[0], self.residuals.size
+        own_lengths, lengths = _measure_lengths(own), _measure_lengths(added)
+        shared = np.vstack([self.residuals, own / own_lengths[:, None]])
+        added = added / lengths[:, :, None]
+        scale = np.hstack([np.tile(own_lengths, (b, 1)), lengths])
+        outputs = []
+        for rows in self._series:
+            most = _find_most_order([one.stop - one.start for one in rows])
+            outputs.append(LaggedProducts(shared, added, rows, most, _LENGTH_PER_ORDER * most))
+        white = [one.whiten(Autoregressions.make_white(b, one.most)) for one in outputs]
+        weights = _solve(np.sum(white, axis=0))
         for _ in range(_ROUNDS):
-            left = self.residuals - joint[:, :k] @ coefficients
-            noise = tuple(self._fit_noise([left[r] for r in rows]) for rows in self._series)
-            whitened = self.whiten(joint, noise)
-            products = whitened.T @ whitened
-            coefficients = _solve(products)
-        innovations = whitened[:, k] - whitened[:, :k] @ coefficients
-        n, twice = innovations.size, 0.0
-        for rows, one in zip(self._series, noise, strict=True):
-            own = np.concatenate([innovations[r] for r in rows])
-            first = sum(min(one.weights.size, r.stop - r.start) for r in rows)
-            twice += own.size * np.log(max(float(np.mean(np.square(own))), _LEAST_VARIANCE))
-            twice += (own.size - first) * np.log(one.innovation_variance)
-            twice += first * np.log(one.variance)
-        spread = float(innovations @ innovations) / max(n - k, 1)
-        inverse = _invert_diagonal(products[:k, :k])
-        used = columns.shape[1] + counted + sum(one.weights.size for one in noise)
-        return ColumnFit(
-            float(twice + used * np.log(max(n, 2))),
-            coefficients / scale,
-            np.sqrt(np.maximum(inverse, 0.0) * spread) / scale,
-            noise,
-            innovations,
-        )
+            noise = [self._fit_noise(one, weights) for one in outputs]
+            whitened = [one.whiten(its) for one, its in zip(outputs, noise, strict=True)]
+            products = np.sum(whitened, axis=0)
+            weights = _solve(products)
+        twice, total = np.zeros(b), np.zeros(b)
+        for one, its, part in zip(outputs, noise, whitened, strict=True):
+            squares = np.einsum("bi,bij,bj->b", weights, part, weights)
+            size, first = int(np.sum(one.sizes)), one.count_first(its.orders)
+            twice += size * np.log(np.maximum(squares / size, _LEAST_VARIANCE))
+            twice += (size - first) * np.log(its.power) + first * np.log(its.variance)
+            total += squares
+        spread = np.maximum(total, 0.0) / max(n - scale.shape[1], 1)
+        inverse = np.maximum(_invert_diagonal(products[:, 1:, 1:]), 0.0)
+        errors = np.sqrt(inverse * spread[:, None]) / scale
+        of_each = zip(*(one.split() for one in noise), strict=True)
+        return zip(twice.tolist(), -weights[:, 1:] / scale, errors, of_each, strict=True)
 
     def whiten(self, values: FloatArray, noise: Sequence[OutputNoise]) -> FloatArray:
         """Whiten values (n,) or (n, k) by the noise of each output."""
@@ -142,35 +173,37 @@ class ResidualModel:
                 whitened[r] = one.whiten(values[r])
         return whitened
 
-    def _fit_noise(self, series: Sequence[FloatArray]) -> OutputNoise:
-        """Fit an autoregression by least squares, its order by Schwarz's criterion.
+    def _fit_noise(self, products: LaggedProducts, weights: FloatArray) -> Autoregressions:
+        """Fit autoregressions to what is left, by weights (B, K) of the columns.
 
-        Series that are too short for its largest order tell nothing of it, and do not limit it.
+        By least squares, their orders by Schwarz's criterion. Series that are too short for the
+        largest order tell nothing of it, and do not limit it.
         """
-        most = _find_most_order([values.size for values in series])
-        stacked = np.concatenate(
-            [
-                np.column_stack([values[most - lag : values.size - lag] for lag in range(most + 1)])
-                for values in series
-                if values.size >= _LENGTH_PER_ORDER * most
-            ]
-        )
-        n = stacked.shape[0]
-        products = stacked.T @ stacked / n
-        variance = max(float(products[0, 0]), self._least)
-        best, weights, least = n * np.log(variance), np.zeros(0), variance
-        for order in range(1, most + 1):
-            past = products[1 : order + 1, 1 : order + 1]
-            past = past + _RIDGE * variance * np.eye(order)
-            found = np.linalg.solve(past, products[1 : order + 1, 0])
-            power = max(
-                float(products[0, 0] - products[1 : order + 1, 0] @ found),
-                self._least,
-            )
-            criterion = n * np.log(power) + order * np.log(n)
-            if criterion < best:
-                best, weights, least = criterion, found, power
-        return OutputNoise(weights, variance, least)
+        n, b = products.told, weights.shape[0]
+        lagged = products.correlate(weights) / n
+        variance = np.maximum(lagged[:, 0, 0], self._least)
+        found = np.zeros((b, products.most))
+        orders, power = np.zeros(b, dtype=np.int64), variance
+        best = n * np.log(variance)
+        for order in range(1, products.most + 1):
+            past = lagged[:, 1 : order + 1, 1 : order + 1]
+            past = past + _RIDGE * variance[:, None, None] * np.eye(order)
+            right = lagged[:, 1 : order + 1, :1]
+            solved = np.linalg.solve(past, right)
+            least = lagged[:, 0, 0] - np.sum(right * solved, axis=(1, 2))
+            least = np.maximum(least, self._least)
+            criterion = n * np.log(least) + order * np.log(n)
+            is_better = criterion < best
+            best, power = np.where(is_better, criterion, best), np.where(is_better, least, power)
+            orders = np.where(is_better, order, orders)
+            found[is_better, :order] = solved[is_better, :, 0]
+        return Autoregressions(found, orders, variance, power)
+
+
+def _measure_lengths(columns: FloatArray) -> FloatArray:
+    """Measure the lengths of columns (…, n); 1 of a column of zeros."""
+    lengths = np.linalg.norm(columns, axis=-1)
+    return np.where(lengths > 0, lengths, 1.0)
 
 
 def _find_most_order(sizes: Sequence[int]) -> int:
@@ -183,25 +216,34 @@ def _find_most_order(sizes: Sequence[int]) -> int:
 
 
 def _solve(products: FloatArray) -> FloatArray:
-    """Solve normal equations (k + 1, k + 1) whose last column is the right-hand side."""
-    k = products.shape[0] - 1
-    scale = _compute_lengths(products[:k, :k])
-    matrix = products[:k, :k] / np.outer(scale, scale) + _RIDGE * np.eye(k)
-    right = products[:k, k] / scale
+    """Solve normal equations (B, K, K) whose first column is the right-hand side.
+
+    Returns the weights (B, K) of the columns in what is left: 1 of the first one.
+    """
+    scale = _compute_lengths(products[:, 1:, 1:])
+    matrix = _add_ridge(products[:, 1:, 1:], scale)
+    right = products[:, 1:, :1] / scale[:, :, None]
     try:
-        return np.asarray(np.linalg.solve(matrix, right) / scale)
+        solved = np.linalg.solve(matrix, right)
     except np.linalg.LinAlgError:  # columns that rounding makes equal
-        return np.asarray(np.linalg.pinv(matrix, hermitian=True) @ right / scale)
+        solved = np.linalg.pinv(matrix, hermitian=True) @ right
+    return np.hstack([np.ones((scale.shape[0], 1)), -solved[:, :, 0] / scale])
 
 
 def _invert_diagonal(products: FloatArray) -> FloatArray:
-    """Compute the diagonal (k,) of the inverse of normal equations (k, k)."""
+    """Compute the diagonals (B, k) of the inverses of normal equations (B, k, k)."""
     scale = _compute_lengths(products)
-    matrix = products / np.outer(scale, scale) + _RIDGE * np.eye(scale.size)
-    return np.asarray(np.diag(np.linalg.pinv(matrix, hermitian=True)) / scale**2)
+    inverse = np.linalg.pinv(_add_ridge(products, scale), hermitian=True)
+    return np.asarray(np.diagonal(inverse, axis1=1, axis2=2) / scale**2)
+
+
+def _add_ridge(products: FloatArray, scale: FloatArray) -> FloatArray:
+    """Scale products (B, k, k) to columns of length 1, and add the ridge."""
+    scaled = products / (scale[:, :, None] * scale[:, None, :])
+    return np.asarray(scaled + _RIDGE * np.eye(scale.shape[1]))
 
 
 def _compute_lengths(products: FloatArray) -> FloatArray:
-    """Compute the lengths (k,) of columns from their products (k, k); 1 of a column of zeros."""
-    powers = np.diag(products)
+    """Compute the lengths (B, k) of columns from their products; 1 of a column of zeros."""
+    powers = np.diagonal(products, axis1=1, axis2=2)
     return np.sqrt(np.where(powers > 0, powers, 1.0))

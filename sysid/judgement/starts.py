@@ -10,7 +10,10 @@ starts free are not white, each start has first-order noise of its own, with the
 its largest likelihood. The start of lowest BIC is preferred. Those whose BIC is less than 6 above
 it are open: odds of 20 to 1 (Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773). One that has
 more parameters is so only if its likelihood gains more than by chance (Wilks 1938): otherwise
-nothing speaks for it, and every short record would leave it open.
+nothing speaks for it, and every short record would leave it open. As with orders, an open start
+makes estimates doubtful if it is at least as likely as the problem's own. A less likely one is a
+note: in about 2000 records (`benchmarks.judgement`) it hedged ten, and no value that was more
+than two errors off for that reason.
 
 A fit whose time lag ends at its upper bound is no explanation, if there is another: its likelihood
 still grows beyond the bound, and the criterion is that of a maximum. Behind half a record of lag, a
@@ -159,25 +162,30 @@ _NAMES: Mapping[StartKind | None, str] = {
 def find_open_starts(
     comparison: StartComparison | None, estimates: Sequence[Estimate]
 ) -> Iterator[Finding]:
-    """Find other starts that the data do not rule out, and that move an estimate."""
+    """Find other starts that the data do not rule out, and that move an estimate.
+
+    If the data rule the own start out, which was not compared before, the best is told anyway.
+    """
     if comparison is None:
         return
     own = comparison.own
+    known = {one.name: one for one in estimates}
     for fit in comparison.fits[1:]:
         moves = comparison.list_moves(fit, estimates)
         notable = tuple(one.parameter for one in moves if abs(one.stderrs) > NOTABLE_MOVE)
-        if not (fit.is_open and notable):
+        if not fit.is_open or not (notable or (fit is comparison.best and not own.is_open)):
             continue
-        units = {one.name: plain_unit(one.unit) for one in estimates}
+        is_doubt = bool(notable) and fit.bic <= own.bic
         told = [
-            f"{one.parameter} is {plain_estimate(one.value, one.stderr)}{units[one.parameter]}"
+            f"{one.parameter} is {plain_estimate(one.value, one.stderr)}"
+            f"{plain_unit(known[one.parameter].unit)}"
             for one in moves
-            if one.parameter in notable
+            if one.parameter in notable or not notable
         ]
         yield Finding(
             "start",
             "start",
-            "caution",
+            "caution" if is_doubt else "note",
             f"the states may start {_NAMES[fit.name]}",
             f"the estimates assume that the states start {_NAMES[own.name]}. The data do not rule "
             f"out that they start {_NAMES[fit.name]}"
@@ -186,7 +194,7 @@ def find_open_starts(
             "",
             own.bic - fit.bic,
             moves,
-            notable,
+            notable if is_doubt else (),
         )
 
 

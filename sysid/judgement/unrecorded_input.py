@@ -35,6 +35,11 @@ from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 
+_NAME = "input before the record"
+GIVE_HISTORY = (
+    "Give the input before the record: trim a longer recording, or put rows with an empty output "
+    "before it."
+)
 _MIN_SAMPLES_PER_PARAMETER = 2  # samples for each parameter, that are left
 _CONTRADICTION = 3.0  # mean square of samples that read assumed input, over that of the others
 _RELEASE = 1e6  # times their range
@@ -42,25 +47,28 @@ _MAX_STEPS = 30  # of least squares, with as many simulations as there are param
 
 
 def find_unrecorded_input(
-    problem: Problem, analysis: Analysis, *, is_contradicted: bool
+    problem: Problem,
+    analysis: Analysis,
+    explained: Sequence[Finding],
+    *,
+    is_contradicted: bool,
 ) -> Iterator[Finding]:
-    """Find an assumed input before the record that the data contradict.
+    """Find an assumed input before the record that the data contradict, unless it is explained.
 
     `is_contradicted` is that of `compare_where_recorded`.
     """
-    if not is_contradicted:
+    if not is_contradicted or any(one.explanation == _NAME for one in explained):
         return
     parts = find_assumed_samples(problem, analysis)
     most = max(int(np.count_nonzero(part)) for part in parts)
     yield Finding(
-        "input before the record",
+        _NAME,
         "history",
         "note",
         "the input moved before the record",
         "samples at the start of the record read an input from before it, which was not recorded. "
         "Its first value is assumed there, and the data contradict it.",
-        "Give the input before the record (trim a longer recording, or put rows with an empty "
-        f"output before it), or use skip: {most}.",
+        f"{GIVE_HISTORY} Or use skip: {most}.",
     )
 
 

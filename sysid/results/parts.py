@@ -130,7 +130,8 @@ class OrderFit:
     is_open : bool
         Whether its BIC is within 6 of the lowest: no strong evidence against it.
     leaves_noise : bool
-        Whether nothing but noise is left by it. Only of the preferred order this is looked for.
+        Whether it tells all its parameters and leaves nothing but noise. Only of the preferred
+        order this is looked for.
     """
 
     model: str

@@ -87,9 +87,13 @@ def find_largest_delays(
 
 
 def interpolate_inputs(
-    model: Model, channels: Sequence[Channel], parameters: Mapping[str, Interval], grid: Grid
+    model: Model,
+    channels: Sequence[Channel],
+    parameters: Mapping[str, Interval],
+    grid: Grid,
+    known: Mapping[str, FineInput] | None = None,
 ) -> list[FineInput]:
-    """Interpolate the inputs, as far back as the largest delays reach."""
+    """Interpolate the inputs but `known` ones, as far back as the largest delays reach."""
     back = find_furthest_offset(model)
     spans = {**parameters, **_measure_ranges(model, channels, grid)}
     reach = find_largest_delays(model, "input", spans, grid)
@@ -98,6 +102,9 @@ def interpolate_inputs(
     fine_inputs = []
     for quantity, channel in zip(model.inputs, channels, strict=True):
         name = quantity.name
+        if known and name in known:
+            fine_inputs.append(known[name])
+            continue
         delay_steps = reach.get(name, 0.0) + back + 1
         averaging = mean if name in averaged else None
         fine_inputs.append(
@@ -194,6 +201,21 @@ def pack_experiment(
     columns = sum(history.columns for history in list_stored_histories(model))
     n_work = max(columns * rows * LANES, 1)
     return PackedExperiment(*builder.build_arrays(), n_work)
+
+
+def replace_input_values(
+    model: Model,
+    ints: IntArray,
+    floats: FloatArray,
+    inputs: Sequence[FineInput],
+    first_inputs: Sequence[float],
+) -> None:
+    """Replace, in place, the values of inputs in the arrays of an experiment."""
+    layout = ExperimentLayout.from_model(model)
+    for i, (signal, first) in enumerate(zip(inputs, first_inputs, strict=True)):
+        offset = ints[layout.locate_input(i, "zero")] - signal.start_index
+        floats[offset : offset + signal.values.size] = signal.values
+        floats[layout.locate_first_input(i)] = first
 
 
 def replace_measured(

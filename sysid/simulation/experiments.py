@@ -12,7 +12,7 @@ from sysid.core.settings import FitSettings
 from sysid.core.types import BoolArray, FloatArray
 from sysid.data.interpolation import FineInput
 from sysid.data.records import Channel, Record
-from sysid.kernels.signals.past_reads import is_difference
+from sysid.kernels.signals.past_reads import is_difference, list_delaying_inputs
 from sysid.language.tree import PastValue, match_plain_state
 from sysid.models.model import (
     DerivedInitial,
@@ -169,9 +169,7 @@ def place_on_grid(
     if not simulates_only:
         for channel in outputs:
             _check_scored(channel, skip, since[channel.name])
-    spans = {
-        p.name: (p.lower, p.upper) if p.fixed is None else (p.fixed, p.fixed) for p in parameters
-    }
+    spans = _list_spans(parameters)
     rows = {p.name: i for i, p in enumerate(parameters)}
     averaged = average_outputs(model, [record])
     added = len(averaged.states) - len(model.states)
@@ -182,6 +180,39 @@ def place_on_grid(
         (*_make_starts(model, grid, outputs, experiment, rows), *_start_integrals(added)),
         tuple(_read_first_value(channel, grid.start) for channel in inputs),
         max([0.0, *find_largest_delays(averaged, "state", spans, grid).values()]),
+    )
+
+
+def _list_spans(parameters: Sequence[Parameter]) -> dict[str, tuple[float, float]]:
+    return {
+        p.name: (p.lower, p.upper) if p.fixed is None else (p.fixed, p.fixed) for p in parameters
+    }
+
+
+def replace_inputs(
+    placed: GridExperiment,
+    model: Model,
+    before: Record,
+    record: Record,
+    parameters: Sequence[Parameter],
+) -> GridExperiment:
+    """Replace the inputs of a placed experiment; the record has the same times and outputs.
+
+    An input that is the same channel as `before` is not interpolated again.
+    """
+    if record is before:
+        return placed
+    inputs = [_find_input(record, quantity.name) for quantity in model.inputs]
+    known = {
+        quantity.name: fine
+        for quantity, channel, fine in zip(model.inputs, inputs, placed.inputs, strict=True)
+        if channel in before.inputs and not list_delaying_inputs(model)
+    }
+    spans = _list_spans(parameters)
+    return replace(
+        placed,
+        inputs=tuple(interpolate_inputs(model, inputs, spans, placed.grid, known)),
+        first_inputs=tuple(_read_first_value(channel, placed.grid.start) for channel in inputs),
     )
 
 

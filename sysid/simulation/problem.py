@@ -38,12 +38,14 @@ from sysid.simulation.experiment_arrays import (
     find_range,
     has_weights,
     pack_experiment,
+    replace_input_values,
     replace_measured,
 )
 from sysid.simulation.experiments import (
     GridExperiment,
     compute_output_weights,
     place_on_grid,
+    replace_inputs,
     replace_outputs,
     split_weights,
 )
@@ -315,6 +317,36 @@ class Problem:
             output_weights=per_output,
         )
 
+    def replace_inputs(self, records: Sequence[Record]) -> "Problem":
+        """Build the problem again for records that differ in their inputs only, not in times.
+
+        Values, holds and histories may differ. Bounds that follow the data stay as they are: what
+        is simulated has nothing to do with them.
+        """
+        experiments = tuple(
+            replace_inputs(placed, self.averaged_model, before, record, self.all_parameters)
+            for placed, before, record in zip(self.experiments, self.records, records, strict=True)
+        )
+        are_alike = all(
+            new.is_placed_as(old)
+            for before, after in zip(self.experiments, experiments, strict=True)
+            for new, old in zip(after.inputs, before.inputs, strict=True)
+        )
+        evaluator = (
+            _replace_input_values(self.evaluator, self.averaged_model, experiments)
+            if are_alike
+            else _build_evaluator(
+                self.averaged_model, experiments, self.all_parameters, self.settings
+            )
+        )
+        return replace(
+            self,
+            records=tuple(records),
+            evaluator=evaluator,
+            experiments=experiments,
+            _shared={},  # may depend on inputs
+        )
+
     @cached_property
     def delaying_ranges(self) -> Mapping[str, tuple[float, float]]:
         """Range over all experiments of each input that a delay reads."""
@@ -579,6 +611,24 @@ def _build_evaluator(
         measured=np.concatenate([s.values for s in samples]),
         n_scored=max(float(np.count_nonzero(weight)), 1.0),
     )
+
+
+def _replace_input_values(
+    evaluator: Evaluator, model: Model, experiments: Sequence[GridExperiment]
+) -> Evaluator:
+    """Replace the inputs of an evaluator by others of as many values."""
+    floats = evaluator.floats.copy()
+    for experiment, (first_int, first_float, _) in zip(
+        experiments, evaluator.offsets.tolist(), strict=True
+    ):
+        replace_input_values(
+            model,
+            evaluator.ints[first_int:],
+            floats[first_float:],
+            experiment.inputs,
+            experiment.first_inputs,
+        )
+    return evaluator._replace(floats=floats)
 
 
 def _replace_measured(

@@ -56,7 +56,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                     change.brief,
                     change.text,
                     counted=1,
-                    records=records,
+                    change={"records": records},
                     is_vague=change.family == "input",
                 )
         direct = context.read_input(name)
@@ -73,13 +73,16 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
 def propose_loads(context: ResidualContext) -> Iterator[Candidate]:
     """Propose a load that begins to act at the input of the plant where an innovation is large.
 
-    An input acts after its time lag, so the load began by so much earlier.
+    An input acts after its time lag, so the load began by so much earlier. One that began before
+    the record is where the plant starts.
     """
     reach = compute_reach(context.problem, context.analysis)
     for channel, position in product(context.moving_inputs[:1], context.find_shocks()):
         begin = float(context.times[position]) - reach
         experiment = context.find_experiment(position)
         records = list(context.problem.records)
+        if begin <= records[experiment].start:
+            continue
         records[experiment] = _add_step(
             records[experiment], channel.name, begin, float(np.ptp(channel.values))
         )
@@ -198,11 +201,14 @@ def _bend(values: FloatArray, middle: float, span: float, power: int) -> FloatAr
 
 def _play(values: FloatArray, width: float) -> FloatArray:
     """Follow values with a play of a width to either side (Krasnosel'skii and Pokrovskii 1989)."""
-    moved, last = np.empty(values.size), float(values[0])
-    for i, value in enumerate(values.tolist()):
-        last = min(max(last, value - width), value + width)
-        moved[i] = last
-    return moved
+    moved, last = list[float](), float(values[0])
+    for value in values.tolist():
+        if last < value - width:
+            last = value - width
+        elif last > value + width:
+            last = value + width
+        moved.append(last)
+    return np.array(moved)
 
 
 def _ignore_small(values: FloatArray, middle: float, width: float) -> FloatArray:
@@ -211,11 +217,16 @@ def _ignore_small(values: FloatArray, middle: float, width: float) -> FloatArray
 
 
 def _limit_rate(values: FloatArray, most: float) -> FloatArray:
-    moved, last = np.empty(values.size), float(values[0])
-    for i, value in enumerate(values.tolist()):
-        last += min(max(value - last, -most), most)
-        moved[i] = last
-    return moved
+    moved, last = list[float](), float(values[0])
+    for value in values.tolist():
+        if value > last + most:
+            last += most
+        elif value < last - most:
+            last -= most
+        else:
+            last = value
+        moved.append(last)
+    return np.array(moved)
 
 
 def _smooth(values: FloatArray, width: int) -> FloatArray:

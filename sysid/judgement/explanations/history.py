@@ -14,7 +14,7 @@ import numpy as np
 from sysid.data.records import Channel, History, Record
 from sysid.judgement.residual_context import CUT_THERE, Candidate, ResidualContext
 from sysid.judgement.start_slopes import list_assumed_starts
-from sysid.judgement.unrecorded_input import compute_reach
+from sysid.judgement.unrecorded_input import GIVE_HISTORY, compute_reach, find_assumed_samples
 
 _SPANS = 4  # of the time that lags reach back before the record
 
@@ -28,17 +28,25 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
     yield from inputs
     yield from _propose_restarts(context)
     states, slopes = list_assumed_starts(problem), context.fixed_start_slopes
-    for before in (np.zeros((context.times.size, 0)), *(one.columns for one in inputs)):
-        if slopes:
-            yield Candidate(
-                "start",
-                "start",
-                np.hstack([*slopes, before]),
-                "the record does not start as the model says",
-                f"the record does not start where the model says that {', '.join(states)} does",
-                "Use initial: free.",
-                is_added=True,
-            )
+    for before in (None, *inputs) if slopes else ():
+        columns = [] if before is None else [before.columns]
+        skipped = 0 if before is None else _count_assumed(context)
+        yield Candidate(
+            "start",
+            "start",
+            np.hstack([*slopes, *columns]),
+            "the record does not start as the model says",
+            f"the record does not start where the model says that {', '.join(states)} does",
+            is_added=True,
+            setting=f"Use initial: free and skip: {skipped}." if skipped else "Use initial: free.",
+            change={"initial": "free", **({"skip": skipped} if skipped else {})},
+        )
+
+
+def _count_assumed(context: ResidualContext) -> int:
+    """Count the samples that read an input from before the record, at most of an output."""
+    parts = find_assumed_samples(context.problem, context.analysis)
+    return max(int(np.count_nonzero(part)) for part in parts)
 
 
 def _propose_restarts(context: ResidualContext) -> Iterator[Candidate]:
@@ -72,7 +80,7 @@ def _propose_restarts(context: ResidualContext) -> Iterator[Candidate]:
 
 def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:
     """Propose that an input was elsewhere before its first sample."""
-    reach = compute_reach(context.problem, context.analysis)
+    reach, skipped = compute_reach(context.problem, context.analysis), _count_assumed(context)
     for name in context.inputs if reach > 0 else ():
         changed = (_change_history(context, name, reach, span) for span in range(_SPANS))
         columns = [context.compute_effect(records) for records in changed]
@@ -83,9 +91,12 @@ def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:
                 "history",
                 context.weigh(np.column_stack(moved)),
                 f"{name} moved before the record",
-                f"{name} was not at its first value before the record, as is assumed",
-                "Begin the record earlier, or leave its first samples out with skip.",
+                f"{name} was not at its first value before the record. Its first value is assumed "
+                "there, and the data contradict it",
+                GIVE_HISTORY,
                 is_added=True,
+                setting=f"Or use skip: {skipped}.",
+                change={"skip": skipped},
             )
 
 

@@ -8,6 +8,7 @@ colour of the noise estimate the same values (Hausman, Econometrica 46 (1978) 12
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from math import lgamma, log
 
 import numpy as np
@@ -171,8 +172,8 @@ def _weigh(context: ResidualContext, fit: ColumnFit, weights: FloatArray) -> tup
         )
         for one in (np.ones(root.size), root)
     )
-    still = fit._replace(coefficients=plain, errors=np.zeros(plain.size))
-    return context.compute_moves(still._replace(coefficients=moved), still)
+    still = replace(fit, coefficients=plain, errors=np.zeros(plain.size))
+    return context.compute_moves(replace(still, coefficients=moved), still)
 
 
 def _are_neighbours(values: FloatArray) -> bool:

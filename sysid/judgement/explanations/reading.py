@@ -45,15 +45,14 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             moved = context.compute_effect(records)
             if moved is not None:
                 is_sure = change is _keep and is_regular
-                setting = f"Use hold: {{{name}: {hold}}}." if is_sure else ""
                 yield Candidate(
                     "reading of an input",
                     "reading",
                     context.weigh(moved),
                     f"{name} is better read {word}",
                     f"the data say that {name} {text}",
-                    setting,
-                    records=records,
+                    setting=f"Use hold: {{{name}: {hold}}}." if is_sure else "",
+                    change={"records": records},
                     is_whole=True,
                 )
     yield from _propose_means(context)
@@ -81,8 +80,8 @@ def _propose_means(context: ResidualContext) -> Iterator[Candidate]:
                 context.weigh(moved),
                 "the output is a mean",
                 f"the output is the mean of the period that {word} at its stamp",
-                f"Use hold: {{{first}: {hold}{more}}}.",
-                records=records,
+                setting=f"Use hold: {{{first}: {hold}{more}}}.",
+                change={"records": records},
                 is_whole=True,
             )
 

@@ -54,7 +54,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                     f"{known:.2g} s only, and so is the time lag",
                     f"Record {channel.name} at the moments at which it changes.",
                     counted=used,
-                    records=records,
+                    change={"records": records},
                     is_whole=True,
                     doubtful=context.delays,
                 )

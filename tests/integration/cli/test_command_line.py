@@ -315,7 +315,8 @@ def test_identify_samples_the_posterior_as_far_as_the_budget_goes(
         ),
         (
             ["--model", "fopdt", "--set", "parameters.LL.upper=9", "--set", "hold.y=zero"],
-            "did you mean 'L'?; --set hold.y: found 'zero'; need one of auto, mean, mean-after for an output",
+            "did you mean 'L'?; --set hold.y: found 'zero'; need one of auto, mean, mean-after for "
+            "an output",
         ),
         (
             ["--model", "fopdt", "--noise-model", "ar1", "--set", "prediction=one-step"],

@@ -8,17 +8,22 @@ import shlex
 from collections.abc import Iterator
 from dataclasses import fields
 from functools import cache
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 
 from lagid import Loss
 from service.cli.common import apply_setting
 from service.cli.identify_command import FIELD_ORIGINS
+from service.cli.main import build_program
 from service.core.bodies.user_documents import parse_yaml
 from service.jobs.job_schemas import JobIn
 from service.plants.tube import Tube
 from sysid.core.text import SETTING, rewrite_settings
+from sysid.data.holds import HOLDS
 from sysid.data.records import Record
 from sysid.identification.identify_arguments import write_setting
 from sysid.models.catalogue.load import catalogue
@@ -39,8 +44,11 @@ from tests.support.source_facts import list_modules
 
 OPEN = "…"
 """Stands in a text for what is known when it is written."""
-VALUES = {("hold", OPEN): ("u", "zero"), ("loss", "scale"): ("scale", "0.3")}
-"""Field and name of a setting → a name and a value for what is open in it."""
+VALUES: dict[tuple[str, str], list[tuple[str, ...]]] = {
+    ("hold", OPEN): [("u", hold) for hold in HOLDS],
+    ("loss", "scale"): [("scale", "0.3")],
+}
+"""Field and name of a setting → names and values for what is open in it."""
 NAMES = {"skip": ("8",), "initial": ("rest", "free")}
 """A setting without entries whose value is open in a text → values of it."""
 OF_A_MODEL = {"history"}
@@ -72,13 +80,17 @@ def list_all_texts() -> list[str]:
     return [text for path in list_modules(("sysid", "service")) for text in list_texts(path)]
 
 
-def fill(match: re.Match[str]) -> str:
-    """Write the setting of a text with values for what is open."""
+def fill(match: re.Match[str]) -> Iterator[str]:
+    """Write the setting of a text with all values for what is open."""
     if match["name"]:
-        return match[0]
+        yield match[0]
+        return
     entries = [entry.split(": ") for entry in match["entries"].split(", ")]
-    filled = [VALUES.get((match["field"], name), (name, value)) for name, value in entries]
-    return f"{match['field']}: {{{', '.join(map(': '.join, filled))}}}"
+    choices: list[list[tuple[str, ...]]] = [
+        VALUES.get((match["field"], name), [(name, value)]) for name, value in entries
+    ]
+    for filled in product(*choices):
+        yield f"{match['field']}: {{{', '.join(map(': '.join, filled))}}}"
 
 
 def list_settings() -> list[str]:
@@ -92,7 +104,8 @@ def list_settings() -> list[str]:
         if f"{name}: {OPEN}" in text
         for value in values
     }
-    return sorted({fill(match) for match in own if "\n" not in match.string} | named)
+    filled = {one for match in own if "\n" not in match.string for one in fill(match)}
+    return sorted(filled | named)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +129,12 @@ def identify(data: Path, *words: object, model: object = "fopdt") -> str:
 
 
 def test_settings_are_found_where_they_are_written() -> None:
-    some = {"hold: {u: zero}", "loss: {kind: soft-l1, scale: 0.3}", "prediction: one-step"}
+    some = {
+        "hold: {u: zero}",
+        "hold: {u: first}",
+        "loss: {kind: soft-l1, scale: 0.3}",
+        "prediction: one-step",
+    }
     some |= {"skip: 8", "initial: free", "initial: rest"}
     assert some <= {*list_settings()}
     assert {"validation.fraction=0.3", "parameters.L.upper=0.5"} <= {*list_changes()}
@@ -259,3 +277,22 @@ def test_a_drift_in_the_model_s_document_is_estimated(data: Path, tmp_path: Path
     found = json.loads(identify(drifting, "--json", model=model))
     (drift,) = [one["value"] for one in found["parameters"] if one["name"] == "drift"]
     assert math.isclose(drift, 0.01, rel_tol=0.02)
+
+
+def list_commands() -> list[str]:
+    """List the commands that messages name: in back-ticks, or at their end after a colon."""
+    named = re.compile(r"`lagid ([a-z][^`]*)`|: lagid ([a-z]+(?: [^\s:]*[^\s:.])*)$")
+    found = [match[1] or match[2] for text in list_all_texts() for match in named.finditer(text)]
+    return sorted({command.replace(OPEN, "one") for command in found})
+
+
+def test_a_command_in_a_message_is_one_with_such_words() -> None:
+    assert len(list_commands()) > 15
+    for line in list_commands():
+        command: Any = typer.main.get_command(build_program())
+        words = shlex.split(line)
+        while hasattr(command, "commands") and words:
+            context = command.make_context("lagid", list(words), resilient_parsing=True)
+            _, command, words = command.resolve_command(context, words)
+        if words:  # without words of its own, only its name is told
+            command.make_context("lagid", words)

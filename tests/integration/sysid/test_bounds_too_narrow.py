@@ -44,7 +44,6 @@ def test_an_offset_outside_its_bounds_is_at_bound_and_is_the_one_to_widen(offset
     assert f"{cure} the bound of y0" in told
 
 
-@pytest.mark.xfail(strict=True, reason="tells twice that the fit is bad, and not of its cause")
 def test_the_verdict_names_the_bound_that_is_too_narrow() -> None:
     assert "y0 lies at its bound" in identify_response(40.0).verdict.text
 

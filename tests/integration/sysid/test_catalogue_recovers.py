@@ -26,7 +26,7 @@ SIMILAR = {"silverbox-9", "narx", "actuator"}
 """Found again by the gate in another way: by a smaller sibling, and in tests of their own."""
 
 HEDGED = {
-    "silverbox": "L is said to depend on the reading of u, whose error is of the integration",
+    "silverbox": "b and k1 are said to depend on the start: errors of the integration remain",
 }
 """Right answers that the judge takes for doubtful."""
 

@@ -239,14 +239,22 @@ def test_orders_within_six_of_the_lowest_criterion_are_open() -> None:
     )
 
 
-def test_an_open_order_that_moves_the_lag_makes_it_dependent() -> None:
-    [found] = list_findings(16.1, 10.0, 16.0)
+def test_an_order_that_is_as_likely_and_moves_the_lag_makes_it_dependent() -> None:
+    [found] = list_findings(16.1, 10.0, 10.0)
     assert (found.severity, found.parameters, found.status) == ("caution", ("L",), "dependent")
     assert found.brief == "the data do not tell sopdt and topdt apart"
     assert "L is 1.300 ± 0.010 s with topdt instead of 1.4 s." in found.text
     assert found.advice == ""
     [move] = found.moves
     assert (move.parameter, move.value, move.stderrs) == ("L", 1.3, pytest.approx(-10.0))
+
+
+def test_an_open_order_that_is_less_likely_than_the_model_is_a_note_with_its_lag() -> None:
+    for other in (10.1, 16.0):
+        [found] = list_findings(16.1, 10.0, other)
+        assert (found.severity, found.parameters, found.advice) == ("note", (), "")
+        assert [move.value for move in found.moves] == [1.3]
+        assert "L is 1.300 ± 0.010 s with topdt instead of 1.4 s." in found.text
 
 
 def test_a_preferred_order_has_its_gain_and_its_lag() -> None:
@@ -266,6 +274,8 @@ def test_a_higher_order_is_advised_if_only_noise_is_left_by_it(leaves_noise: boo
     [other] = find_other_orders(orders, "vessel", [LAG])
     words = "Give your model as many time constants, or use the model topdt."
     assert other.advice == (words if leaves_noise else "")
+    [untold] = find_other_orders(orders, "sopdt", [replace(LAG, status="ambiguous")])
+    assert untold.advice == ""
 
 
 def test_the_model_s_own_order_is_no_finding() -> None:

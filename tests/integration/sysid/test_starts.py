@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 
 from sysid.core.errors import InvalidSettings
+from sysid.data.records import Channel, Record
 from sysid.export.export import export_model
 from sysid.identification.identify import identify
+from sysid.judgement.afterwards import explain_afterwards
 from sysid.models.catalogue.load import load_model
 from sysid.results.identification import Identification
+from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
 
 TIMES = 0.5 * np.arange(160)
@@ -111,3 +114,22 @@ def test_the_history_of_a_search_has_the_parameters_of_its_result(result: Identi
     columns = {len(one.parameters) for island in found.history for one in island}
     assert columns == {4}
     assert {len(island.parameters) for island in found.islands} == {4}
+
+
+def test_a_sweeps_run_compares_starts_if_it_is_asked_to(data: dict[str, np.ndarray]) -> None:
+    """Else it estimates them, and the rest is told when the run is opened."""
+    swept = identify("fopdt", data, compare_orders=False)
+    asked = identify("fopdt", data, compare_orders=False, initial="auto")
+    assert (swept.initial, asked.initial) == (None, "rest")
+    assert "x(0)" in swept
+    assert not any(one.family == "start" for one in swept.findings)
+    (u, y) = (Channel(name, TIMES, data[name]) for name in ("u", "y"))
+    problem = Problem.build(load_model("fopdt"), [Record((u,), (y,))])
+    opened = explain_afterwards(problem, swept)
+    [start] = [one for one in opened.findings if one.family == "start"]
+    assert "(initial: rest)" in start.text
+    assert start.severity == "note"  # an estimated start contains the rest, and is less exact
+    gain = next(one for one in start.moves if one.parameter == "K")
+    assert gain.value == pytest.approx(asked["K"].value, rel=1e-3)
+    assert gain.stderr == pytest.approx(asked["K"].stderr, rel=0.1)
+    assert opened.parameter_values == swept.parameter_values

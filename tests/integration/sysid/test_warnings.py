@@ -96,9 +96,6 @@ def test_residuals_on_validation_data_are_those_that_are_tested() -> None:
     assert all(one.status == "identified" for one in found.parameters)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="says of a true model that a part of the response is missing"
-)
 def test_a_true_model_that_misses_in_another_range_is_not_said_to_lack_dynamics() -> None:
     found = identify_beside_larger_steps()
     assert not is_warned(found, "missing from the model")

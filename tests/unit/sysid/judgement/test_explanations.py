@@ -109,7 +109,6 @@ def test_a_start_that_the_model_fixes_wrongly_is_named(plant: Process) -> None:
         assert explain_start(plant, 0.0, seed) == []
 
 
-@pytest.mark.xfail(strict=True, reason="a start far off is called a reading of u, or a unit")
 def test_a_start_that_is_far_off_is_named() -> None:
     assert [explain_start(OTHER, 1.0, seed)[0] for seed in (1, 2, 3)] == 3 * ["start"]
 

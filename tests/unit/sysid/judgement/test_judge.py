@@ -63,13 +63,7 @@ def explain_line(*parts: np.ndarray) -> Explained:
         (0.2, 0.1),
         (0.2, 0.4),
         (0.5, 0.4),
-        pytest.param(
-            0.5,
-            0.1,
-            marks=pytest.mark.xfail(
-                strict=True, reason="what gains little alone is not tried beside the first"
-            ),
-        ),
+        (0.5, 0.1),
     ],
 )
 def test_two_defects_are_both_found(bend: float, jump: float) -> None:
@@ -277,7 +271,6 @@ def test_outliers_hide_no_change_and_no_change_hides_them() -> None:
     assert "outliers" in names
 
 
-@pytest.mark.xfail(strict=True, reason="the gain of a second finding is beside that of the first")
 def test_what_was_found_first_is_the_reason() -> None:
     u = draw_levels(1)
     share = TIMES / TIMES[-1]

@@ -163,9 +163,12 @@ def test_validation_data_that_depend_on_an_input_are_always_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("colour", "words"), [("coloured", "errors allow for it"), ("drifting", "too small")]
+    ("colour", "words", "severity"),
+    [("coloured", "errors allow for it", "note"), ("drifting", "too small", "caution")],
 )
-def test_the_colour_of_noise_is_a_note(colour: NoiseColour, words: str) -> None:
+def test_colour_is_a_note_unless_errors_are_too_small(
+    colour: NoiseColour, words: str, severity: str
+) -> None:
     (found,) = list_unexplained("whiteness", 0.3, is_done=True, colour=colour)
-    assert found.severity == "note"
+    assert found.severity == severity
     assert words in found.text

@@ -12,6 +12,8 @@ from sysid.judgement.input_hold import (
     replace_holds,
     write_hold,
 )
+from sysid.judgement.levels import DEFECT_GAIN
+from sysid.judgement.residual_context import Simulations
 from sysid.models.catalogue.load import load_model
 from sysid.results.findings import Finding
 from sysid.results.parts import InputHold
@@ -19,9 +21,12 @@ from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
 from tests.support.library.judged_records import (
     FAST,
+    FINE,
+    NOISE,
     STEP,
     N,
     draw_levels,
+    draw_noise,
     draw_record,
     make_record,
 )
@@ -34,7 +39,7 @@ LINES = InputHold("u", "first", "varies smoothly", "zero", {"L": 1.7, "K": 2.005
 
 
 def find(hold: InputHold, doubt: str = "", rms: float = 0.1) -> list[Finding]:
-    return list(find_other_readings(PROBLEM, [hold], [doubt], [GAIN, LAG], rms))
+    return list(find_other_readings(PROBLEM, [hold], [doubt], [GAIN, LAG], rms, Simulations()))
 
 
 def test_a_reading_in_doubt_that_leaves_an_interval_makes_that_estimate_dependent() -> None:
@@ -48,10 +53,25 @@ def test_a_reading_in_doubt_that_leaves_an_interval_makes_that_estimate_dependen
     assert found.advice == ""  # both fit as well
 
 
-def test_a_reading_that_fits_clearly_better_is_the_advice() -> None:
-    (found,) = find(replace(LINES, rms_other=0.09), "That fits better")
-    assert found.gain == pytest.approx(2 * PROBLEM.n_scored * np.log(0.1 / 0.09))
+def find_true_reading(bend: float, most: int | None = None) -> Finding:
+    """Find that the true reading fits better, of a record whose output has a bend beside it."""
+    u = draw_levels(1)
+    clean = FAST.respond(np.repeat(u, FINE))[::FINE]
+    record = make_record(u, clean + bend * clean**2 + NOISE * draw_noise(1), reading="auto")
+    problem = Problem.build(load_model("fopdt"), [record])
+    values = {**FAST.values, "x(0)": FAST.gain * float(u[0])}
+    truth = InputHold("u", "zero", "has two levels", "zero", values, 0.09)
+    (found,) = find_other_readings(problem, [truth], ["It fits"], [LAG], 0.1, Simulations(most))
+    return found
+
+
+def test_a_reading_that_fits_clearly_better_is_the_advice_if_it_leaves_nothing_but_noise() -> None:
+    found = find_true_reading(0.0)
+    assert found.gain is not None
+    assert found.gain > DEFECT_GAIN
     assert found.advice == "Use hold: {u: zero}."
+    assert find_true_reading(0.2).advice == ""  # the output is curved beside
+    assert find_true_reading(0.0, most=3).advice == ""  # nobody knows
 
 
 def test_a_doubt_that_moves_nothing_is_a_note() -> None:
@@ -90,7 +110,9 @@ def test_jumps_between_irregular_samples_are_uncertain_by_a_period() -> None:
     u = draw_levels(1)
     record = Record((Channel("u", times, u),), (Channel("y", times, u),))
     problem = Problem.build(load_model("fopdt"), [record])
-    notes = find_other_readings(problem, list_input_holds(problem), [""], [GAIN, LAG], 0.1)
+    notes = find_other_readings(
+        problem, list_input_holds(problem), [""], [GAIN, LAG], 0.1, Simulations()
+    )
     (found,) = (one for one in notes if one.explanation == "irregular sampling")
     period = float(found.text.rpartition(", ")[2].removesuffix(" s"))
     assert period == pytest.approx(STEP, rel=0.2)

@@ -166,7 +166,9 @@ def test_a_full_fit_to_the_true_input_finds_the_truth() -> None:
     u = draw_levels(1)
     y = FAST.respond(hold(np.minimum(u, 1.2)))[::FINE] + NOISE * draw_noise(1)
     context = build_context([make_record(u, y)], "fopdt", FAST.values)
-    found = context.refit(context.replace_input("u", lambda values: np.minimum(values, 1.2)))
+    found = context.refit(
+        {"records": context.replace_input("u", lambda values: np.minimum(values, 1.2))}
+    )
     assert found is not None
     assert found.criterion < context.residual_model.without.criterion
     for move in found.moves:
@@ -246,7 +248,7 @@ def test_moves_on_a_log_scale_keep_the_sign_of_a_value() -> None:
     far = fit.coefficients.copy()
     far[scaled] = -3.0 * fit.errors[scaled]
     (move,) = [
-        one for one in context.compute_moves(fit._replace(coefficients=far)) if one.parameter == "T"
+        one for one in context.compute_moves(replace(fit, coefficients=far)) if one.parameter == "T"
     ]
     assert move.stderr is not None
     assert 0.0 < move.value < value

@@ -7,8 +7,9 @@ import pytest
 from scipy.signal import lfilter
 
 from sysid.core.types import FloatArray
+from sysid.judgement.lagged_products import OutputNoise
 from sysid.judgement.levels import DEFECT_GAIN
-from sysid.judgement.residual_model import OutputNoise, ResidualModel
+from sysid.judgement.residual_model import ResidualModel
 from sysid.residuals.series import ResidualPart
 from tests.support.profiles import draw_seeds
 
@@ -296,3 +297,89 @@ def test_short_series_do_not_hide_the_colour_of_an_output(sizes: tuple[int, ...]
     (noise,) = model.without.noise
     assert noise.weights[0] == pytest.approx(0.9, abs=0.25)
     assert compute_gain(model, late[:, None].astype(np.float64), 1) < DEFECT_GAIN
+
+
+def whiten_parts(noise: dict[str, OutputNoise], parts: list[ResidualPart]) -> FloatArray:
+    """Build the matrix (n, n) that whitens all series."""
+    matrix = np.zeros((parts[-1].rows.stop, parts[-1].rows.stop))
+    for part in parts:
+        matrix[part.rows, part.rows] = whiten_by_hand(noise[part.output], part.times.size)
+    return matrix
+
+
+def fit_autoregression(series: list[FloatArray]) -> OutputNoise:
+    """Fit an autoregression of up to six lags to series, by Schwarz's criterion."""
+    sizes = [one.size for one in series]
+    most = max(p for p in range(7) if sum(n for n in sizes if n >= 2 * p) >= 20 * p)
+    lags = [
+        np.column_stack([one[most - lag : one.size - lag] for lag in range(most + 1)])
+        for one in series
+        if one.size >= 2 * most
+    ]
+    values = np.concatenate(lags)
+    found = []
+    for order in range(most + 1):
+        past = values[:, 1 : order + 1]
+        weights = np.linalg.lstsq(past, values[:, 0], rcond=None)[0]
+        power = float(np.mean((values[:, 0] - past @ weights) ** 2))
+        criterion = len(values) * np.log(power) + order * np.log(len(values))
+        found.append((criterion, weights, power))
+    _, weights, power = min(found, key=lambda one: one[0])
+    return OutputNoise(weights, found[0][2], power)
+
+
+def fit_by_samples(
+    residuals: FloatArray, joint: FloatArray, parts: list[ResidualPart]
+) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+    """Fit columns (n, k) as the module says it, sample by sample.
+
+    Returns the criterion with the orders of the noise only, coefficients, errors, innovations.
+    """
+    names = list(dict.fromkeys(part.output for part in parts))
+    series = {name: [part.rows for part in parts if part.output == name] for name in names}
+    coefficients = np.linalg.lstsq(joint, residuals, rcond=None)[0]
+    for _ in range(2):
+        left = residuals - joint @ coefficients
+        noise = {name: fit_autoregression([left[r] for r in series[name]]) for name in names}
+        white = whiten_parts(noise, parts)
+        coefficients = np.linalg.lstsq(white @ joint, white @ residuals, rcond=None)[0]
+    rest = white @ (residuals - joint @ coefficients)
+    (n, k), criterion = joint.shape, 2.0 * -np.linalg.slogdet(white)[1]
+    for name, one in noise.items():
+        own = np.concatenate([rest[r] for r in series[name]])
+        criterion += own.size * np.log(np.mean(own**2)) + one.weights.size * np.log(n)
+    inverse = np.linalg.inv((white @ joint).T @ (white @ joint))
+    return criterion, coefficients, np.sqrt(np.diag(inverse) * (rest @ rest) / (n - k)), rest
+
+
+@pytest.mark.parametrize("weights", [(), (0.8,), (1.6, -0.8)])
+@pytest.mark.parametrize(
+    ("sizes", "outputs"),
+    [
+        ((200,), ()),
+        ((130, 9, 60), ()),
+        ((12,) * 12, ()),
+        ((90, 3, 1, 90), ("y", "y", "z", "z")),
+        ((19,), ()),
+    ],
+)
+def test_products_give_what_whitened_samples_give(
+    sizes: tuple[int, ...], outputs: tuple[str, ...], weights: tuple[float, ...]
+) -> None:
+    """For many explanations at a time, of one column and two, beside what is taken."""
+    parts, n = make_parts(*sizes, outputs=outputs), sum(sizes)
+    slopes, taken = draw_columns(n, 2, 1), draw_columns(n, 2, 8)[:, 1:]
+    explanations = [draw_columns(n, 2 + i % 2, i + 10)[:, 1:] for i in range(7)]
+    counted = [i % 3 for i in range(7)]
+    residuals = np.concatenate([draw_noise(size, weights, i) for i, size in enumerate(sizes)])
+    model = make_model(residuals + taken[:, 0] + 2.0 * explanations[4][:, 0], slopes, parts)
+    fits = model.fit_each(explanations, counted, [taken])
+    for fit, columns, more in zip(fits, explanations, counted, strict=True):
+        joint, used = np.hstack([slopes, taken, columns]), 1 + columns.shape[1] + more
+        criterion, coefficients, errors, rest = fit_by_samples(model.residuals, joint, parts)
+        assert fit.criterion == pytest.approx(criterion + used * np.log(n), abs=1e-6)
+        np.testing.assert_allclose(fit.coefficients, coefficients, atol=1e-6 * errors.max())
+        np.testing.assert_allclose(fit.errors, errors, rtol=1e-6)
+        np.testing.assert_allclose(fit.innovations, rest, atol=1e-6)
+        again = model.fit(np.hstack([taken, columns]), more)
+        assert again.criterion == pytest.approx(fit.criterion, abs=1e-8)

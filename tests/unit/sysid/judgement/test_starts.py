@@ -66,11 +66,15 @@ def test_an_open_start_that_moves_an_estimate_is_found() -> None:
     rested = comparison.take(comparison.best)
     free = replace(rested.fits[1], is_open=True)
     estimates = analyse_estimate(rested.own.problem, rested.own.theta).estimates
-    [found] = find_open_starts(replace(rested, fits=(rested.own, free)), estimates)
+    [note] = find_open_starts(replace(rested, fits=(rested.own, free)), estimates)
+    assert (note.severity, note.parameters) == ("note", ())
+    likely = replace(free, criteria=rested.own.criteria)
+    [found] = find_open_starts(replace(rested, fits=(rested.own, likely)), estimates)
     assert found.severity == "caution"
     assert "(initial: free)" in found.text
     assert set(found.parameters) <= {"K", "T", "L", "y0"}
-    assert found.gain == pytest.approx(rested.own.bic - free.bic)
+    assert note.gain == pytest.approx(rested.own.bic - free.bic)
+    assert found.gain == 0.0
     assert abs(found.moves[0].stderrs) > 1.0
 
 

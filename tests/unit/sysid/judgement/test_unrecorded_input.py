@@ -100,10 +100,11 @@ def test_of_a_record_that_begins_at_rest_nothing_is_told() -> None:
 def test_a_contradiction_is_a_note_that_says_what_to_skip() -> None:
     problem = build_problem(make_recording(0, was_at_rest=False), history=False)
     analysis = analyse_problem(problem)
-    assert list(find_unrecorded_input(problem, analysis, is_contradicted=False)) == []
-    [found] = find_unrecorded_input(problem, analysis, is_contradicted=True)
+    assert list(find_unrecorded_input(problem, analysis, [], is_contradicted=False)) == []
+    [found] = find_unrecorded_input(problem, analysis, [], is_contradicted=True)
     assert (found.severity, found.parameters) == ("note", ())
     assert found.advice.endswith("skip: 8.")
+    assert list(find_unrecorded_input(problem, analysis, [found], is_contradicted=True)) == []
 
 
 def test_samples_that_read_an_assumed_input_end_with_the_estimated_lag() -> None:

@@ -155,12 +155,10 @@ def test_lags_a_period_apart_are_listed_though_an_assumed_input_tells_them_apart
     assert list_told(wrongly_assumed) == pytest.approx([LAG + PERIOD, LAG + 2 * PERIOD], abs=0.05)
 
 
-@pytest.mark.xfail(strict=True, reason="a contradiction and an explanation tell the same")
 def test_an_assumed_input_is_told_once(wrongly_assumed: Identification) -> None:
     assert sum("assumed" in text for text in wrongly_assumed.warnings) == 1
 
 
-@pytest.mark.xfail(strict=True, reason="what gains 383 and moves nothing is taken for noise")
 def test_an_assumed_input_is_no_noise(wrongly_assumed: Identification) -> None:
     assert wrongly_assumed.noise_model == "white"
 

@@ -12,7 +12,7 @@ from sysid.core.errors import InvalidBounds, InvalidRecord, InvalidSettings, Rec
 from sysid.core.jit import jit_compile
 from sysid.core.settings import FitSettings, Loss, PredictionKind
 from sysid.core.types import FloatArray
-from sysid.data.records import Channel, Record
+from sysid.data.records import Channel, History, Record
 from sysid.simulation.evaluator import Evaluator, evaluate_population
 from sysid.simulation.problem import Problem, build_simulation_problem, compute_metrics
 from tests.support.library.small_models import (
@@ -335,6 +335,48 @@ def test_other_outputs_make_the_arrays_of_a_new_problem(
         for replaced, built in zip(before.evaluator, alone.evaluator, strict=True):
             np.testing.assert_array_equal(replaced, built)
         assert before.output_scale == alone.output_scale
+
+
+def _list_other_inputs(force: Channel, side: Channel) -> list[tuple[Channel, Channel]]:
+    """Inputs of other values, holds and histories, on the same times."""
+    before = History(force.times[:5] - 0.5, np.full(5, 2.0))
+    return [
+        (replace(force, values=np.clip(force.values, -0.5, 0.5), hold="zero"), side),
+        (replace(force, values=force.values**2, hold="zero", history=before), side),
+        (replace(force, values=np.roll(force.values, 1), hold="first"), side),
+        (force, replace(side, values=-side.values)),
+    ]
+
+
+@pytest.mark.parametrize("delay", ["L", "L + abs(v)"])
+@pytest.mark.parametrize("number", range(4))
+def test_other_inputs_make_the_arrays_of_a_new_problem(number: int, delay: str) -> None:
+    """Also those of another hold, and of an input that a delay reads."""
+    t = 0.1 * np.arange(60.0)
+    force, side = Channel("u", t, np.sin(t), "V", hold="zero"), Channel("v", t, np.cos(t), "s")
+    outputs = (Channel("y", t, np.cos(t), "m"),)
+    equation = f"u(t - ({delay})) - b*x(t - L) + v(t)"
+    inputs = {"u": "V", "v": "s"}
+    model = differential({"x": equation}, "x", inputs=inputs, initial={"x": "measured"})
+    other = Record((replace(force, values=np.cos(t)), side), outputs)
+    first = [Record((force, side), outputs), other]
+    changed = [Record(_list_other_inputs(force, side)[number], outputs), other]
+    problem = Problem.build(model, first, skip=1)
+    before = [array.copy() for array in map(np.asarray, problem.evaluator)]
+    replaced, alone = problem.replace_inputs(changed), Problem.build(model, changed, skip=1)
+    for one, built in zip(replaced.evaluator, alone.evaluator, strict=True):
+        np.testing.assert_array_equal(one, built)
+    for one, kept in zip(problem.evaluator, before, strict=True):
+        np.testing.assert_array_equal(one, kept)
+
+
+def test_nothing_that_depends_on_inputs_is_shared_with_a_problem_of_others() -> None:
+    problem = Problem.build(duffing(), [record()])
+    (force,) = record().inputs
+    other = replace(record(), inputs=(replace(force, hold="first"),))
+    assert problem.share("hold", lambda: problem.records[0].inputs[0].hold) == force.hold
+    replaced = problem.replace_inputs([other])
+    assert replaced.share("hold", lambda: replaced.records[0].inputs[0].hold) == "first"
 
 
 def test_what_outputs_do_not_change_is_computed_once_for_all_of_them() -> None:
