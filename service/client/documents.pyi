@@ -1266,7 +1266,7 @@ class OrderFitDocument(TypedDict):
     is_open: bool
     """whether its BIC is within 6 of the lowest: no strong evidence against it"""
     leaves_noise: bool
-    """whether nothing but noise is left by it. Only of the preferred order this is looked for"""
+    """whether it tells all its parameters and leaves nothing but noise. Only of the preferred order this is looked for"""
 
 class OutcomeDocument(TypedDict):
     """Outcome of a job: that of its only run, or of the best one by RMS."""
