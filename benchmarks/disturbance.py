@@ -1,7 +1,8 @@
 """Noise inside the plant: coverage of 95 % intervals, and errors beside the exact likelihood.
 
 The draws of a kind have one plant, and their own load, noise and input. A load is an
-Ornstein-Uhlenbeck process at the plant's input, held between the steps of a fine integration. The
+Ornstein-Uhlenbeck process at the plant's input, held between the steps of a fine integration. It
+has moved the first-order plants before the record, which start at rest otherwise. The
 `drift` of a sensor is a random walk of its output, which no load explains.
 
 Kinds: none (noise of the sensor alone), step and binary (with the load's correlation time, s),
@@ -23,7 +24,7 @@ from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.optimize import minimize
 from scipy.stats import binomtest
 
@@ -82,6 +83,7 @@ class Kind:
     sensor: float = 0.02
     walk: float = 0.0
     offset: float = 0.0
+    prelude: float = 0.0  # time before the record in which the load moves the plant, s
     linear: Callable[[Mapping[str, float]], tuple[FloatArray, FloatArray, list[float]]] | None = (
         None
     )
@@ -183,7 +185,12 @@ def _make_first_order(**changes: Any) -> Kind:
     def rates(x: FloatArray, read: Any, before: Any) -> list[float]:
         return [(2.0 * read("u", "L") - x[0]) / 12.3]
 
-    fields: dict[str, Any] = {"inputs": _binary, "linear": _first_order, "offset": 20.0}
+    fields: dict[str, Any] = {
+        "inputs": _binary,
+        "linear": _first_order,
+        "offset": 20.0,
+        "prelude": 120.0,
+    }
     return Kind(load_model("fopdt"), FIRST_ORDER, rates, **(fields | changes))
 
 
@@ -319,9 +326,13 @@ def simulate_kind(kind: Kind, seed: int) -> Record:
     inputs = kind.inputs(random, times)
     act = None if kind.control is None else kind.control(random, times)
     fine, x = h / FINE, np.array(kind.start, dtype=np.float64)
-    states, load = [x.copy()], random.normal(0.0, kind.load)
+    load = random.normal(0.0, kind.load)
     keep = np.exp(-fine / kind.time)
     spread = kind.load * np.sqrt(1.0 - keep**2)
+    for _ in range(round(kind.prelude / fine)):
+        x = _advance(kind.rates, x, lambda *_: load, lambda _: x[0], fine)  # noqa: B023
+        load = keep * load + spread * random.normal()
+    states = [x.copy()]
     root = np.sqrt(fine) * np.array(kind.diffusion or [0.0] * x.size)
     y = np.empty(kind.samples)
     first = next(iter(inputs))
@@ -387,16 +398,17 @@ def sum_innovations(
 ) -> float:
     """Minus log-likelihood of measurements (N,) of the first state."""
     x, p, total, n = start.copy(), spread.copy(), 0.0, start.size
+    turned = np.ascontiguousarray(phi.T)
     for k in range(y.size):
         s = p[0, 0] + variance
         e = y[k] - x[0]
         total += 0.5 * (e * e / s + np.log(s))
-        gain = p[:, 0] / s
+        gain = p[0] / s
         x = phi @ (x + gain * e) + drive[k]
         for i in range(n):
             for j in range(n):
                 p[i, j] -= gain[i] * gain[j] * s
-        p = phi @ p @ phi.T + covariance
+        p = phi @ p @ turned + covariance
         if not np.abs(x[0]) < 1e8:
             return 1e12
     return total
@@ -435,6 +447,8 @@ def fit_likelihood(kind: Kind, record: Record, start: Mapping[str, float]) -> di
             noise[own, own] = 2.0 * size**2 / constant
             spread = np.zeros((own + 1, own + 1))
             spread[own, own] = size**2
+            if kind.prelude:
+                spread = solve_continuous_lyapunov(whole, -noise)
         else:
             whole, noise = a, np.diag(np.exp(2 * rest[1 : 1 + own]))
             spread = np.zeros((own, own))
@@ -470,7 +484,7 @@ def discretise(a: FloatArray, noise: FloatArray, h: float) -> tuple[FloatArray, 
     block = np.zeros((2 * n, 2 * n))
     block[:n, :n], block[:n, n:], block[n:, n:] = -a, noise, a.T
     whole = expm(block * h)
-    phi = whole[n:, n:].T
+    phi = np.ascontiguousarray(whole[n:, n:].T)
     return phi, phi @ whole[:n, n:]
 
 

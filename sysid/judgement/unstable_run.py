@@ -20,7 +20,7 @@ interval is often far too narrow: disturbances grow, and so do the sensitivities
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -111,7 +111,7 @@ def compare_one_step(
 
 def _build_predictions(problem: Problem) -> Problem | None:
     """Build the problem with a filter, else that of one step ahead; None if there is neither."""
-    changes = {"weights": problem.output_weights, "deviations": None}
+    changes: dict[str, Any] = {"weights": problem.output_weights, "deviations": None}
     with suppress(InvalidSettings):
         return problem.rebuild(loss=replace(problem.loss, noise_model="load"), **changes)
     if not reads_outputs(problem.model):

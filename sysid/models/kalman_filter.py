@@ -53,8 +53,13 @@ from sysid.models.model import (
     Output,
 )
 from sysid.models.parameters import Parameter
+from sysid.models.rest import NoRestError, solve_rest
+from sysid.models.sections import STEADY, get_interval
 
 PlantNoise = Literal["plant", "load"]
+_Pair = tuple[str, str]
+_Slopes = Mapping[_Pair, Expression]
+_Covariance = Mapping[frozenset[str], PastValue]
 
 _PARAMETERS = ("load", "tau", "noise")
 _SMALLEST, _LARGEST = 1e-3, 1e3  # deviation of a load at its input over the sensor's, by spans
@@ -252,7 +257,11 @@ def _add_covariance(model: Model, diffusion: Mapping[str, Expression]) -> Model:
     pairs = [(a, b) for i, a in enumerate(noisy) for b in noisy[i:]]
     covariance = {frozenset(pair): PastValue(f"P[{','.join(pair)}]", "state") for pair in pairs}
     changes = [_make_rate(pair, noisy, slopes, covariance, diffusion) for pair in pairs]
-    starts = [_make_start(pair, diffusion, model) for pair in pairs]
+    resting = _list_resting(model)
+    rates = {p: rate for p, rate in zip(pairs, changes, strict=True) if resting.issuperset(p)}
+    state_of = {pair: covariance[frozenset(pair)].name for pair in pairs}
+    solved = _solve_stationary(rates, state_of, model)
+    starts = [_make_start(pair, solved.get(state_of[pair])) for pair in pairs]
     return replace(
         model,
         states=(*model.states, *(ModelSignal(covariance[frozenset(p)].name) for p in pairs)),
@@ -261,10 +270,6 @@ def _add_covariance(model: Model, diffusion: Mapping[str, Expression]) -> Model:
         order=(*model.order, *range(len(names), len(names) + len(pairs))),
         corrections=tuple(_make_corrections(model, noisy, pairs, covariance)),
     )
-
-
-_Slopes = Mapping[tuple[str, str], Expression]
-_Covariance = Mapping[frozenset[str], PastValue]
 
 
 def _find_noisy(
@@ -298,16 +303,49 @@ def _make_rate(
     return add(*sides)
 
 
-def _make_start(
-    pair: tuple[str, str], diffusion: Mapping[str, Expression], model: Model
-) -> FixedInitial | DerivedInitial:
-    """Make the start of a covariance: a load is stationary, and the start of a state is known."""
-    first, second = pair
-    is_load = first.startswith("d[") and first in diffusion
-    if first != second or not is_load:
+def _list_resting(model: Model) -> set[str]:
+    """List the loads, and the states that begin at rest: noise moved them before the record."""
+    return {
+        state.name
+        for state, start in zip(model.states, model.initial, strict=True)
+        if _is_load(state.name) or (isinstance(start, DerivedInitial) and start.text == STEADY)
+    }
+
+
+def _solve_stationary(
+    pairs: Mapping[_Pair, Expression], names: Mapping[_Pair, str], model: Model
+) -> dict[str, Expression]:
+    """Solve A P + P Aᵀ + Q = 0 for some covariances by their rates; the others are 0.
+
+    If they have no rest, as behind an integrator, or if it depends on an estimated start, loads
+    alone are stationary.
+    """
+    known: dict[str, Expression] = {names[pair]: ZERO for pair in names if pair not in pairs}
+    for state, start in zip(model.states, model.initial, strict=True):
+        if isinstance(start, FixedInitial):
+            known[state.name] = Number(start.value)
+        elif isinstance(start, DerivedInitial):
+            known[state.name] = start.expression
+    intervals = {parameter.name: get_interval(parameter) for parameter in model.parameters}
+    rates = {names[pair]: rate for pair, rate in pairs.items()}
+    try:
+        return solve_rest(rates, known, intervals, is_rate=True)
+    except NoRestError:
+        loads = {pair: rate for pair, rate in pairs.items() if all(map(_is_load, pair))}
+        return _solve_stationary(loads, names, model) if len(loads) < len(pairs) else {}
+
+
+def _make_start(pair: _Pair, solved: Expression | None) -> FixedInitial | DerivedInitial:
+    """Make the start of a covariance; a variance is not negative, even of an unstable plant."""
+    if solved is None:
         return FixedInitial(0.0)
-    size = Symbol(f"load[{first[2:-1]}]", "parameter")
-    return DerivedInitial(Binary("*", size, size), "stationary")
+    if pair[0] == pair[1]:
+        solved = FunctionCall("max", (solved, ZERO))
+    return DerivedInitial(solved, "stationary")
+
+
+def _is_load(state: str) -> bool:
+    return state.startswith("d[")
 
 
 def _make_corrections(

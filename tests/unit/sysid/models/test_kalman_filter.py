@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_continuous_lyapunov
 
 from sysid.core.errors import InvalidModel, InvalidSettings
 from sysid.core.settings import Loss
@@ -299,3 +299,33 @@ def test_an_individual_has_the_same_bits_alone_and_among_others() -> None:
     np.testing.assert_array_equal(
         problem.predict(theta), [problem.predict(one[None])[0] for one in theta]
     )
+
+
+def test_a_plant_at_rest_was_moved_by_its_load_before_the_record() -> None:
+    record = _record()
+    model = parse_model(_write_lagged(initial="steady"))
+    problem = Problem.build(model, [record], loss=Loss(noise_model="load"))
+    theta = np.array([[GAIN, CONSTANT, LAG, LOAD, CORRELATION]])
+
+    a = np.array([[-1 / CONSTANT, GAIN / CONSTANT], [0.0, -1 / CORRELATION]])
+    q = np.diag([0.0, 2 * LOAD**2 / CORRELATION])
+    u = record.inputs[0].values
+    expected = filter_outputs(
+        _list_lagged_steps(u),
+        np.array([[1.0, 0.0]]),
+        np.ones(1),
+        np.array([GAIN * u[0], 0.0]),
+        solve_continuous_lyapunov(a, -q),
+        record.outputs[0].values[:, None],
+    )
+
+    assert problem.evaluate_fitness(theta)[0] == pytest.approx(expected.fitness, rel=1e-6)
+
+
+def test_a_start_behind_an_integrator_is_known_and_its_load_is_stationary() -> None:
+    document = _write_lagged(equations={"x": "K*u(t - L)/T"})
+    problem = Problem.build(parse_model(document), [_record()], loss=Loss(noise_model="load"))
+    theta = np.array([[GAIN, CONSTANT, LAG, LOAD, CORRELATION]])
+    _, deviations = problem.predict_ahead(theta)
+    assert deviations[0, 0] == 1.0
+    assert np.all(deviations[0, 1:] > 1.0)
