@@ -34,6 +34,7 @@ _LENGTH_PER_ORDER = 2  # samples at least, of a series that tells of the noise
 _ROUNDS = 2  # of generalised least squares and noise model, in turn
 _RIDGE = 1e-10  # of columns of length 1: only a column that others hold is kept from dividing by 0
 _LEAST_VARIANCE = 1e-20  # of the residuals: less is rounding
+_ROUNDING = 1e-15  # of the squares of what is added up: what sums of products leave is that exact
 _MOST_NUMBERS = 1 << 20  # of columns, and of products, of explanations that are fitted at a time
 
 _Fitted = tuple[float, FloatArray, FloatArray, tuple[OutputNoise, ...]]
@@ -181,17 +182,19 @@ class ResidualModel:
         """
         n, b = products.told, weights.shape[0]
         lagged = products.correlate(weights) / n
-        variance = np.maximum(lagged[:, 0, 0], self._least)
+        added_up = np.linalg.norm(self.residuals) + np.sum(np.abs(weights[:, 1:]), axis=1)
+        lowest = np.maximum(self._least, _ROUNDING * np.square(added_up) / n)
+        variance = np.maximum(lagged[:, 0, 0], lowest)
+        ridge = np.maximum(_RIDGE * variance, lowest)[:, None, None]
         found = np.zeros((b, products.most))
         orders, power = np.zeros(b, dtype=np.int64), variance
         best = n * np.log(variance)
         for order in range(1, products.most + 1):
-            past = lagged[:, 1 : order + 1, 1 : order + 1]
-            past = past + _RIDGE * variance[:, None, None] * np.eye(order)
+            past = lagged[:, 1 : order + 1, 1 : order + 1] + ridge * np.eye(order)
             right = lagged[:, 1 : order + 1, :1]
             solved = np.linalg.solve(past, right)
             least = lagged[:, 0, 0] - np.sum(right * solved, axis=(1, 2))
-            least = np.maximum(least, self._least)
+            least = np.maximum(least, lowest)
             criterion = n * np.log(least) + order * np.log(n)
             is_better = criterion < best
             best, power = np.where(is_better, criterion, best), np.where(is_better, least, power)

@@ -232,7 +232,9 @@ def test_a_run_of_a_sweep_keeps_the_local_interval() -> None:
     y = 28.5 + 2.0 * 2.0 + 2.0 * 5.0 * (1.0 - np.exp(-rise / 8.37))
     data = record(u, y + 0.09 * np.random.default_rng(4).standard_normal(47), 0.5)
     model = load_model("fopdt")
-    profiled, local = (identify(model, data, compare_orders=orders) for orders in (True, False))
+    profiled, local = (
+        identify(model, data, initial="rest", compare_orders=orders) for orders in (True, False)
+    )
     assert {one.open_ends for one in local.parameters} == {()}
     for name in ("K", "T"):
         one, other = profiled[name], local[name]
