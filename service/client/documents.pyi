@@ -1043,7 +1043,7 @@ class LossInDocument(TypedDict):
     """what is minimised; `soft-l1` limits the influence of outliers"""
     scale: NotRequired[float]
     """residual beyond which `soft-l1` grows linearly, in the output's unit"""
-    noise_model: NotRequired[Literal["auto", "white", "ar1"]]
+    noise_model: NotRequired[Literal["auto", "white", "ar1", "plant", "load"]]
     """noise model of the estimates"""
 
 class MarginsDocument(TypedDict):
@@ -1192,6 +1192,20 @@ class NoiseInDocument(TypedDict):
     seed: NotRequired[int]
     """seed of the noise; the same seed gives the same noise"""
 
+class NoiseSourceDocument(TypedDict):
+    """A source of noise, and its size."""
+
+    place: str
+    """the output, input or state where it acts"""
+    kind: Literal["sensor", "plant", "load"]
+    """white noise of a sensor, diffusion of a state, or a slow load"""
+    deviation: float | None
+    """standard deviation, in `unit`; of a diffusion that after one second"""
+    unit: str
+    """its unit"""
+    correlation_time: float | None
+    """correlation time of a load, s"""
+
 class OnsetDelayDocument(TypedDict):
     """Onset delay of one output behind one input in one experiment."""
 
@@ -1305,6 +1319,16 @@ class ParameterSummaryDocument(TypedDict):
     """quantiles of estimate minus reference"""
     cramer_rao_bound: NotRequired[float | None]
     """least standard deviation under the added noise"""
+
+class PlantNoiseDocument(TypedDict):
+    """Noise inside the plant, and the free run beside the predictions that the result shows."""
+
+    sources: list[NoiseSourceDocument]
+    """the sensors, then the noise inside the plant"""
+    rms_free: float | None
+    """RMS error of the free run with the same estimates, in the unit of the result's `rms`; none if it diverges"""
+    fit_free: float | None
+    """its fit, %"""
 
 class PointDocument(TypedDict):
     """Estimate of one quantity at one label."""
@@ -1639,7 +1663,7 @@ class RunDocument(TypedDict):
         Literal["white", "first-order", "coloured", "drifting", "clustered"] | None
     ]
     """colour of the residuals that the errors assume. If they drift over the whole record, the errors are lower bounds"""
-    noise_model: NotRequired[Literal["white", "ar1"] | None]
+    noise_model: NotRequired[Literal["white", "ar1", "plant", "load"] | None]
     """noise model of the estimates"""
     correlation_times: NotRequired[dict[str, float | None] | None]
     """correlation time of each output's noise, s, where the noise model has one"""
@@ -1677,6 +1701,8 @@ class RunDocument(TypedDict):
     """selected terms; empty if none were to be selected"""
     initial: NotRequired[Literal["rest", "free", "measured"] | None]
     """start of the states that the estimates assume; none: as the model's document says"""
+    plant_noise: NotRequired[PlantNoiseDocument | None]
+    """sizes of the noise, and the free run, if noise acts inside the plant. Then `rms`, fits and signals are those of predictions one sample ahead"""
 
 class RunPageDocument(TypedDict):
     """Runs of a job."""

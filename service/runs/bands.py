@@ -121,6 +121,7 @@ def _compute_bands(
                 ),
                 estimate_noise(result.agreement.estimation, noise_degrees),
                 stored.body["prediction"],
+                noise_model=result.noise_model,
             )
     except (SysidError, NotFound, InvalidRequest, RowNotFound, ObjectMissing) as error:
         raise Conflict(f"the bands of run {run_id} cannot be computed: {error}") from error

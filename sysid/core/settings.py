@@ -28,7 +28,8 @@ TopologyName = Literal["one-way-ring", "ring", "fully-connected", "star", "uncon
 SequenceKind = Literal["paper", "adaptive"]
 PredictionKind = Literal["simulation", "one-step"]
 LossKind = Literal["squares", "soft-l1"]
-NoiseModel = Literal["auto", "white", "ar1"]
+NoiseModel = Literal["auto", "white", "ar1", "plant", "load"]
+FoundNoiseModel = Literal["white", "ar1", "plant", "load"]
 StartKind = Literal["rest", "free", "measured"]
 InitialSetting = Literal["rest", "free", "measured", "auto"]
 SEARCH_METHODS: tuple[SearchMethod, ...] = get_args(SearchMethod)
@@ -324,7 +325,8 @@ class Loss:
     under first-order noise gives the estimates
     (`sysid.noise_models.generalised_least_squares`). ``auto`` selects ``ar1`` for free runs by
     squares whose coloured residuals have no other explanation (`sysid.judgement.judge`), else
-    ``white``.
+    ``white``. ``plant`` and ``load`` are noise inside the plant: the likelihood of a Kalman filter
+    is maximised (`sysid.models.kalman_filter`). With `noise` in the document, ``auto`` does that.
 
     Attributes
     ----------
@@ -349,7 +351,7 @@ class Loss:
 
     def __post_init__(self) -> None:
         check_settings(self, "/loss")
-        if self.noise_model == "ar1" and self.kind != "squares":
+        if self.noise_model not in ("auto", "white") and self.kind != "squares":
             raise InvalidSettings(
                 "/loss/noise_model",
                 f"{self.noise_model} is not available with {self.kind}; need the loss 'squares'",
@@ -402,7 +404,7 @@ class FitSettings:
         if self.weights is not None:
             object.__setattr__(self, "weights", dict(self.weights))
         check_settings(self, "")
-        if self.prediction == "one-step" and self.loss.noise_model == "ar1":
+        if self.prediction == "one-step" and self.loss.noise_model not in ("auto", "white"):
             raise InvalidSettings(
                 "/loss/noise_model",
                 f"{self.loss.noise_model} needs the prediction 'simulation'; one-step predictions "

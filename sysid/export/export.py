@@ -14,6 +14,7 @@ from sysid.export.description import write_json_source
 from sysid.export.python import write_python_source
 from sysid.export.python_control import write_control_source
 from sysid.language.evaluation import evaluate_expression
+from sysid.models.kalman_filter import is_noise_parameter
 from sysid.models.model import Model, name_initial_state
 from sysid.models.parse import keep_terms
 from sysid.models.starts import replace_starts
@@ -128,10 +129,14 @@ def _collect_values(
                 estimate.name, estimate.value, estimate.unit, estimate.stderr, estimate.status
             )
             for estimate in result.parameters
+            if not is_noise_parameter(estimate.name)
         )
         if result.correlation is None or result.covariance is None:
             return values, None
-        return values, Covariance(result.correlation.names, result.covariance)
+        names = result.correlation.names
+        rows = [i for i, name in enumerate(names) if not is_noise_parameter(name)]
+        covariance = result.covariance[np.ix_(rows, rows)]
+        return values, Covariance(tuple(names[i] for i in rows), covariance)
     units = {estimate.name: estimate.unit for estimate in model.parameters}
     units |= {name_initial_state(state.name, 0): state.unit for state in model.states}
     numbers = _add_tied_values(model, result)

@@ -22,6 +22,7 @@ import numpy as np
 from sysid.core.types import FloatArray
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 from sysid.models.model import (
+    Correction,
     DerivedInitial,
     EstimatedInitial,
     FixedInitial,
@@ -63,7 +64,13 @@ def find_scalings(model: Model, parameters: Sequence[Parameter]) -> FloatArray:
     states = tuple(state.name for state in model.states)
     outputs = tuple(output.expression for output in model.outputs)
     return _find_cached_scalings(
-        states, model.equations, outputs, model.initial, model.histories, tuple(parameters)
+        states,
+        model.equations,
+        outputs,
+        model.initial,
+        model.histories,
+        model.corrections,
+        tuple(parameters),
     )
 
 
@@ -74,6 +81,7 @@ def _find_cached_scalings(
     outputs: tuple[Expression, ...],
     initial: tuple[InitialState, ...],
     histories: tuple[HistoryFunction, ...],
+    corrections: tuple[Correction, ...],
     parameters: tuple[Parameter, ...],
 ) -> FloatArray:
     """Find the scalings, cached for the runs of one model; the result is read-only."""
@@ -94,6 +102,10 @@ def _find_cached_scalings(
     for history in histories:
         weight = weights.weigh_expression(history.expression)
         weights.require_equal({history.state: Fraction(1)}, weight)
+    for one in corrections:
+        weights.require_equal({}, weights.weigh_expression(one.variance))
+        for state, change in (*one.gains, *one.losses):
+            weights.require_equal({state: Fraction(1)}, weights.weigh_expression(change))
     null = _solve_null_space(weights.equations, [*states, *free])
     free_rows = [[row.get(name, Fraction(0)) for name in free] for row in null]
     exponents = _reduce_to_echelon(free_rows, len(free))

@@ -83,6 +83,7 @@ from sysid.uncertainty.intervals import (
     keep_in_bounds,
     mark_poor_intervals,
 )
+from sysid.uncertainty.noise_sizes import explore_noise_sizes
 from sysid.uncertainty.profile_ends import FoundEnds, extrapolate_ends, find_profile_ends
 from sysid.uncertainty.unequal_noise import fit_unequal_noise
 
@@ -210,6 +211,7 @@ def find_best_estimate(
     minima = search.collect_minima(recorded)
     if explains and refines:
         search.follow_profiles(noise.theta)
+    search.average_over_noise(noise.theta)
     parameters = search.problem.free_parameters
     marked = mark_poor_intervals(parameters, search.analysis.estimates)
     marked = mark_poor_intervals(parameters, mark_changing(marked, half, limit))
@@ -432,7 +434,7 @@ class _EstimateSearch:
         noise, or if the integration step is too long for them (not `is_settled`).
         """
         requested, squares = self.problem.loss.noise_model, GeneralisedEstimate(self.theta, {}, 0)
-        if requested == "white" or not self._refines:
+        if requested not in ("auto", "ar1") or not self._refines:
             return squares._replace(is_complete=requested != "ar1")
         if requested == "ar1":
             return self._use_noise_model()
@@ -448,7 +450,7 @@ class _EstimateSearch:
     def _may_be_ar1(self) -> bool:
         """Whether the residuals of a free run by squares are coloured: else there is no choice."""
         problem, uncertainty = self.problem, self.analysis.uncertainty
-        is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
+        is_free = problem.is_free_run and problem.loss.kind == "squares"
         is_asked = problem.loss.noise_model == "auto" and self._refines
         colour = "white" if uncertainty is None else uncertainty.noise_colour
         return is_free and is_asked and colour in ("coloured", "drifting")
@@ -524,6 +526,17 @@ class _EstimateSearch:
             if name in self.analysis.minima
         }
         estimates = compose_intervals(self.analysis.estimates, ends, beyond)
+        self.analysis = replace(self.analysis, estimates=estimates)
+
+    def average_over_noise(self, theta: FloatArray) -> None:
+        """Extend the intervals around an estimate (D,) by what sizes of noise leave open."""
+        uncertainty = self.analysis.uncertainty
+        if uncertainty is None or not self.problem.model.corrections or self._is_late():
+            return
+        left = self._budget.count_left()
+        found = explore_noise_sizes(self.problem, theta, uncertainty.covariance, left)
+        self._budget.spend(found.evaluations)
+        estimates = compose_intervals(self.analysis.estimates, found.average())
         self.analysis = replace(self.analysis, estimates=estimates)
 
     def _extrapolate_sets(

@@ -1,6 +1,6 @@
 """Conclude a search: refinement, uncertainty, validation, warnings."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from math import inf
 
@@ -8,13 +8,14 @@ import numpy as np
 
 from sysid.core.errors import DivergedEverywhere, NothingIdentifiable
 from sysid.core.jit import read_clock
-from sysid.core.settings import GeneticAlgorithm, StartKind
+from sysid.core.settings import FoundNoiseModel, GeneticAlgorithm, StartKind
 from sysid.core.threads import use_one_thread
 from sysid.data.records import find_common_sample_time
 from sysid.identifiability.exchange import describe_exchanges
 from sysid.identification.best_estimate import IslandEnd, find_best_estimate, is_refining
 from sysid.identification.budget import Budget
 from sysid.identification.deadline import Clock, Deadline
+from sysid.identification.plant_noise import describe_plant_noise
 from sysid.islands.run_state import RunState
 from sysid.judgement.agreement import (
     find_better_yardstick,
@@ -262,7 +263,7 @@ def _build_identification(
     )
     budget.spend(simulations.spent)
     analysis = replace(analysis, estimates=conclude_estimates(estimates, findings))
-    declared = [parameter.name for parameter in problem.model.parameters]
+    declared = [parameter.name for parameter in problem.given_model.parameters]
     fit = FitPercent(
         metrics.fit_percent, None if validated is None else validated.metrics.fit_percent
     )
@@ -289,7 +290,7 @@ def _build_identification(
         degrees=inf if uncertainty is None else uncertainty.degrees,
         noise_sd=None if uncertainty is None else uncertainty.noise_sd,
         noise_colour=None if uncertainty is None else uncertainty.noise_colour,
-        noise_model="ar1" if any(times.values()) else "white",
+        noise_model=_get_noise_model(problem, times),
         correlation_times=times,
         noise_deviations=None
         if problem.settings.weights is not None
@@ -312,10 +313,11 @@ def _build_identification(
         warnings=list_warnings(findings),
         substeps=problem.model.solver.substeps,
         initial=_get_start(asked, best.starts),
+        plant_noise=describe_plant_noise(problem, theta, metrics.rms),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
         history=_extend_histories(best.state, best.ends),
         migrations=state.migrations,
-        simulated=split_outputs(problem, simulated),
+        simulated=split_outputs(problem, problem.predict_ahead(theta[None])[0][0]),
         simulated_validation=() if validated is None else validated.simulated,
         sample_time=problem.share("sample time", lambda: find_common_sample_time(problem.records)),
     )
@@ -333,6 +335,14 @@ def _get_start(asked: Problem, starts: StartComparison | None) -> StartKind | No
         return starts.own.name
     initial = asked.settings.initial
     return None if initial == "auto" else initial
+
+
+def _get_noise_model(problem: Problem, times: Mapping[str, float]) -> FoundNoiseModel:
+    """Get the noise model of the estimates; ``ar1`` was not taken where no noise is coloured."""
+    asked = problem.loss.noise_model
+    if asked == "plant" or asked == "load":
+        return asked
+    return "ar1" if any(times.values()) else "white"
 
 
 def _compute_input_history(problem: Problem) -> tuple[float, ...]:

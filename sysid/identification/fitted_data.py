@@ -31,7 +31,7 @@ def collect_fitted_data(
         else (validation_problem, result.simulated_validation)
     )
     counts = {}
-    if problem.prediction == "one-step" and validation_problem is None:
+    if not problem.is_free_run and validation_problem is None:
         counts = count_past_output_coefficients(problem.model, problem.all_parameters)
     series = list_residual_series(
         tested, _join_outputs(tested, simulated), result.correlation_times

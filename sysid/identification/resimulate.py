@@ -63,7 +63,7 @@ def resimulate_run(
         if missing:
             raise InvalidSettings("/parameters", f"there is no estimate of {', '.join(missing)}")
         theta = np.array([values[name] for name in problem.free_names])
-        simulated = split_outputs(problem, problem.predict(theta[None])[0])
+        simulated = split_outputs(problem, problem.predict_ahead(theta[None])[0][0])
         if validation is None:
             return FittedSignals(simulated, ())
         return FittedSignals(simulated, simulate_validation(validation, problem, estimates).scored)

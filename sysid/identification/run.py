@@ -11,6 +11,7 @@ from dataclasses import replace
 
 from sysid.core.jit import read_clock
 from sysid.core.settings import GeneticAlgorithm
+from sysid.identification.free_run_starts import find_free_run_starts
 from sysid.islands.archipelago import create_islands, make_plans
 from sysid.islands.evolve import (
     compute_next_border,
@@ -49,14 +50,19 @@ def begin_run(
 ) -> RunState:
     """Create a run before its first generation; `warm` values seed a quarter of the population.
 
-    The improved search of a polynomial is also seeded by one-step least squares. Values of all
+    The improved search of a polynomial is also seeded by one-step least squares, and that of a
+    filter by free runs. Values of all
     free parameters count as an earlier result, after which a run settles sooner. Values of only
     some parameters just seed the search.
     """
     warm_starts = (warm,) if isinstance(warm, Mapping) else tuple(warm or ())
     warm_starts = tuple(values for values in warm_starts if values)
     is_warm = any(all(name in values for name in problem.free_names) for values in warm_starts)
-    starts = find_equation_error_starts(problem, algorithm)
+    starts = (
+        find_free_run_starts(problem, algorithm, seed)
+        if problem.model.corrections
+        else find_equation_error_starts(problem, algorithm)
+    )
     islands = create_islands(
         problem, algorithm, seed, warm_starts, starts.values, starts.evaluations
     )

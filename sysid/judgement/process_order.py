@@ -246,7 +246,7 @@ def _write_delay(comparison: OrderComparison, fit: OrderFit) -> str:
 def _read_assumptions(
     problem: Problem, theta: FloatArray, estimates: Sequence[Estimate]
 ) -> _Assumptions | None:
-    if problem.prediction != "simulation" or problem.loss.kind != "squares":
+    if not problem.is_free_run or problem.loss.kind != "squares":
         return None
     delays = find_delay_parameters(problem)
     process = _recognise(problem, theta)

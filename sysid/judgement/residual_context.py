@@ -554,7 +554,7 @@ class ResidualContext:
         Not of predictions one step ahead, which forget their start.
         """
         states = list_assumed_starts(self.problem)
-        if self.problem.prediction != "simulation" or len(states) > _MOST_STATES:
+        if not self.problem.is_free_run or len(states) > _MOST_STATES:
             return []
         if not self.simulations.allow(_MOST_START_SIMULATIONS * len(states)):
             return []

@@ -22,7 +22,8 @@ _MAX_GROWTH, _MAX_TRIALS = 1e6, 5  # of the step
 
 def list_assumed_starts(problem: Problem) -> list[str]:
     """List the states whose starts are not estimated."""
-    pairs = zip(problem.model.states, problem.model.initial, strict=True)
+    model = problem.untied_model
+    pairs = zip(model.states, model.initial, strict=True)
     return [state.name for state, start in pairs if not isinstance(start, EstimatedInitial)]
 
 

@@ -181,7 +181,7 @@ def compare_where_recorded(
     too little is recorded. Time lags are compared up to half of the shortest record.
     """
     assumed = np.concatenate(find_assumed_samples(problem, analysis))[problem.scored_rows]
-    if not delays or problem.prediction != "simulation":
+    if not delays or not problem.is_free_run:
         return RecordedComparison()
     if assumed.any() and not _may_contradict(analysis, assumed):
         return RecordedComparison()

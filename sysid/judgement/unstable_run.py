@@ -1,39 +1,44 @@
-"""Predict one step ahead where a free run in a closed loop is misled by disturbances.
+"""Predict from measured outputs where a free run in a closed loop is misled by disturbances.
 
 In an unstable plant each disturbance grows, and a free run attributes all of it to the parameters:
 its estimates are far off, or those of a stable plant. Such a plant is recorded in a closed loop
-only. Predictions one step ahead start again at each measured output, so they forget disturbances
-(Ljung, System Identification, 2nd ed., ch. 3.2 and 13). That needs outputs that are states, and
-measurements whose noise is small beside the disturbances.
+only. A filter corrects the states by each measured output, so it forgets disturbances
+(Ljung, System Identification, 2nd ed., ch. 3.2 and 13). A recursion has no filter, and is predicted
+one step ahead. That needs outputs that are states, and measurements whose noise is small beside
+the disturbances.
 
 So if residuals are not white, and an input follows them or the free run is unstable, the model is
-fitted one step ahead as well. Its estimates are reported if the free run is unstable there too,
-or if its residuals are white. A free run counts as unstable if the effect of some start is ten
+fitted to such predictions as well. Its estimates are reported if the free run is unstable there
+too, or if its residuals are white. A free run counts as unstable if the effect of some start is ten
 times as large in the last quarter of an experiment as in its first half. A double integrator
 reaches three.
 
-A value depends on that if its 95 % interval does not hold that of one step ahead. Such an
+A value depends on that if its 95 % interval does not hold that of the predictions. Such an
 interval is often far too narrow: disturbances grow, and so do the sensitivities.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from sysid.core.errors import InvalidSettings
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.judgement.input_hold import replace_holds, write_hold
 from sysid.judgement.residual_context import find_delay_parameters
 from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.minima.minima import scan_parameters
+from sysid.models.kalman_filter import is_noise_parameter
 from sysid.noise_models.generalised_least_squares import select_coloured_outputs
 from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.series import iterate_parts
 from sysid.results.findings import Finding, list_moves
 from sysid.results.parts import InputHold
 from sysid.search.refine import refine_candidates
+from sysid.simulation.noise_levels import add_noise_levels
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
@@ -44,7 +49,7 @@ _MOST_SIMULATIONS = 3000
 
 
 class OneStepComparison(NamedTuple):
-    """Estimates of one step ahead where disturbances mislead a free run, and what shows that.
+    """Estimates by predictions where disturbances mislead a free run, and what shows that.
 
     `options` are those that give these estimates.
     """
@@ -64,7 +69,7 @@ def compare_one_step(
     has_feedback: bool,
     doubtful: Sequence[InputHold] = (),
 ) -> tuple[OneStepComparison | None, int]:
-    """Estimate one step ahead if disturbances mislead a free run (D,); None if they do not.
+    """Estimate by predictions if disturbances mislead a free run (D,); None if they do not.
 
     `doubtful` inputs are read the other way, as they are likelier to be. Returns the simulations
     too.
@@ -76,35 +81,49 @@ def compare_one_step(
         has_feedback or compute_growth(problem, theta) >= _MIN_GROWTH
     ):
         return None, 0
-    loss = replace(problem.loss, noise_model="white")
-    read = replace_holds(problem, doubtful) if doubtful else problem
-    ahead = read.rebuild(
-        prediction="one-step", loss=loss, weights=problem.output_weights, deviations=None
-    )
-    (end,) = refine_candidates(ahead, [theta], most, is_late)
-    if end is None:
+    ahead = _build_predictions(replace_holds(problem, doubtful) if doubtful else problem)
+    if ahead is None:
         return None, 0
+    starts = add_noise_levels(ahead, dict(zip(problem.free_names, theta.tolist(), strict=True)))
+    start = starts[np.argmin(ahead.evaluate_fitness(starts))]
+    (end,) = refine_candidates(ahead, [start], most, is_late)
+    if end is None:
+        return None, len(starts)
     names = find_delay_parameters(ahead)
     delays = [d for d, name in enumerate(ahead.free_names) if name in names]
     scan = scan_parameters(ahead, end, delays, most - end.evaluations, is_late)
     best = scan.best
-    growth = compute_growth(problem, best.theta)
+    values = dict(zip(ahead.free_names, best.theta.tolist(), strict=True))
+    growth = compute_growth(problem, np.array([values[name] for name in problem.free_names]))
     predicted = analyse_estimate(ahead, best.theta)
-    spent = end.evaluations + scan.evaluations + predicted.evaluations
+    spent = len(starts) + end.evaluations + scan.evaluations + predicted.evaluations
     if growth >= _MIN_GROWTH:
         cause = f"the free run is unstable: an error of its start grows {growth:.2g} times"
     elif _are_white(ahead, predicted):
-        cause = "one step ahead the residuals are white: the noise acts inside the plant"
+        cause = "residuals of predictions are white: the noise acts inside the plant"
     else:
         return None, spent
-    options = "prediction: one-step", *map(write_hold, doubtful)
-    return OneStepComparison(cause, predicted.estimates, options), spent
+    is_filter = bool(ahead.model.corrections)
+    setting = "loss: {noise_model: load}" if is_filter else "prediction: one-step"
+    estimates = tuple(one for one in predicted.estimates if not is_noise_parameter(one.name))
+    return OneStepComparison(cause, estimates, (setting, *map(write_hold, doubtful))), spent
+
+
+def _build_predictions(problem: Problem) -> Problem | None:
+    """Build the problem with a filter, else that of one step ahead; None if there is neither."""
+    changes: dict[str, Any] = {"weights": problem.output_weights, "deviations": None}
+    with suppress(InvalidSettings):
+        return problem.rebuild(loss=replace(problem.loss, noise_model="load"), **changes)
+    if not reads_outputs(problem.model):
+        return None
+    loss = replace(problem.loss, noise_model="white")
+    return problem.rebuild(prediction="one-step", loss=loss, **changes)
 
 
 def find_misled_run(
     estimates: Sequence[Estimate], comparison: OneStepComparison | None
 ) -> Iterator[Finding]:
-    """Find a free run that disturbances mislead, with the estimates of one step ahead."""
+    """Find a free run that disturbances mislead, with the estimates by predictions."""
     if comparison is None:
         return
     ahead = {one.name: one.value for one in comparison.estimates}
@@ -119,7 +138,7 @@ def find_misled_run(
         "serious" if outside else "note",
         "disturbances mislead the free run",
         f"{comparison.cause}. So a free run attributes disturbances to the parameters. Predicted "
-        f"one step ahead they are {described}.",
+        f"from measured outputs they are {described}.",
         f"Use {' and '.join(comparison.options)}.",
         moves=moves,
         parameters=tuple(outside),
@@ -127,11 +146,11 @@ def find_misled_run(
 
 
 def _may_mislead(problem: Problem, analysis: Analysis) -> bool:
-    """Whether residuals of a free run by squares are not white, and there are other predictions."""
-    is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
+    """Whether residuals of a free run by squares are not white."""
+    is_free = problem.is_free_run and problem.loss.kind == "squares"
     uncertainty = analysis.uncertainty
     is_white = uncertainty is None or uncertainty.noise_colour == "white"
-    return is_free and not is_white and reads_outputs(problem.model)
+    return is_free and not is_white
 
 
 def compute_growth(problem: Problem, theta: FloatArray) -> float:

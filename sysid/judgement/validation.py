@@ -82,11 +82,12 @@ def simulate_validation(
     validation: Problem, estimation: Problem, estimates: Sequence[Estimate]
 ) -> ValidationRun:
     """Simulate validation data with all estimates fixed, as `validate_estimates` says."""
-    model, changes = validation.untied_model, validation.settings.parameters
+    changes = validation.settings.parameters
     is_part = validation.settings.scored_from is not None
     # Other records may start otherwise, if the data were to tell how the fitted ones start.
     initial = (estimation if is_part else validation).settings.initial
-    shared = {p.name for p in (validation.all_parameters if is_part else model.parameters)}
+    declared = validation.model.parameters
+    shared = {p.name for p in (validation.all_parameters if is_part else declared)}
     fixed = {e.name: _to_fixed_parameter(e) for e in estimates if e.name in shared}
     other_changes = {name: fields for name, fields in changes.items() if name not in shared}
     fixed_problem = validation.rebuild(

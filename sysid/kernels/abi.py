@@ -9,8 +9,10 @@ theta : K rows of `stride`: row = parameter, column = individual; P is a multipl
 ints, floats : one experiment as packed by `sysid.simulation.experiment_arrays`.
 work : scratch memory of the experiment's size; its initial contents do not matter.
 predictions : null, or M_e rows of `predictions_stride`: simulated value at each measured time.
+    If measurements correct the states, the deviations √S of the innovations follow.
 loss : P sums; the kernel *adds* the experiment's loss, Σ w²e² for squares or
-    Σ 2s²(√(1 + (we/s)²) − 1) for soft-l1.
+    Σ 2s²(√(1 + (we/s)²) − 1) for soft-l1. If measurements correct the states, Σ w²e²/S, and
+    after `stride` of them Σ log S of the scored samples.
 
 A kernel raises nothing: a diverging simulation leaves ``inf`` or ``nan`` in its own column.
 """

@@ -81,10 +81,12 @@ def _declare_pure_functions(module: ir.Module) -> None:
 
 
 def _add_loss(lanes: VectorBuilder, block: "_Block") -> None:
-    """Simulate a block and add its losses to the stored ones."""
-    loss, target = block.emit_simulation(), block.arguments["loss"]
-    total = lanes.load_row(target, block.first)
-    lanes.store_row(lanes.add(total, loss), target, block.first)
+    """Simulate a block and add its sums to the stored ones."""
+    target, index = block.arguments["loss"], block.first
+    for value in block.emit_simulation():
+        total = lanes.load_row(target, index)
+        lanes.store_row(lanes.add(total, value), target, index)
+        index = lanes.builder.add(index, block.arguments["stride"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +100,8 @@ class _Block:
     arguments: dict[str, IrValue]
     first: IrValue
 
-    def emit_simulation(self) -> IrValue:
-        """Emit the simulation; return the sum of the losses."""
+    def emit_simulation(self) -> list[IrValue]:
+        """Emit the simulation; return the sums of the loss."""
         lanes, model, experiment = self.lanes, self.model, self.experiment
         step = experiment.get_number("step")
         scope = ParameterEnvironment(
@@ -113,7 +115,8 @@ class _Block:
         states = States(lanes, model, experiment, self.arguments["work"], start, scope)
         row = states.fill_history()
         delays = Delays(lanes, model, scope, step)
-        signals = SignalReaders(lanes, model, experiment, states, delays, self.variant.one_step)
+        changes_past = self.variant.one_step or past_reads.corrects_past(model)
+        signals = SignalReaders(lanes, model, experiment, states, delays, changes_past)
         comparison = LossAccumulator(
             lanes, model, self.variant, experiment, self.arguments, self.first
         )
@@ -127,7 +130,7 @@ class _Block:
         build_environment = _bind_environment(lanes, model, scope, states, signals, time_step)
         comparison.compare_step(time_step, states, build_environment)
         loop.leave_if(lanes.builder.icmp_signed(">=", time_step.index, experiment.get_head("last")))
-        if self.variant.one_step:
+        if changes_past:
             states.store_states(time_step.row)
             signals.begin_step(time_step)
         following = self._emit_following_states(time_step, states, build_environment, start)
@@ -137,7 +140,8 @@ class _Block:
         loop.update(time_step.row, states.advance_row(time_step.row))
         loop.update(time_step.index, lanes.builder.add(time_step.index, lanes.make_integer(1)))
         loop.repeat()
-        return self._mark_divergence(comparison.loss, states)
+        loss, *others = comparison.sums
+        return [self._mark_divergence(loss, states), *others]
 
     def _mark_divergence(self, loss: IrValue, states: States) -> IrValue:
         """Turn the loss into nan if a state is not finite, even if the outputs hide it."""

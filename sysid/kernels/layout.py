@@ -8,8 +8,12 @@ from dataclasses import dataclass
 
 from sysid.models.model import Model
 
-HEAD_FIELDS = ("last", "reach", "rows")
-"""Last integration step; rows of history that delays reach back; rows of the buffer."""
+HEAD_FIELDS = ("last", "reach", "rows", "deviations")
+"""Fields of an experiment.
+
+Last integration step; rows of history that delays reach back; rows of the buffer; rows from a
+prediction to its deviation (for corrections only).
+"""
 
 STATE_FIELDS = ("row", "given")
 """Row of theta with the initial value, or -1; index of the measured first samples, or -1."""
@@ -21,12 +25,13 @@ Index of the value at step 0; fine points in a step; begin and end of a step in 
 input jumps, so they differ from 0 and `points`); largest delay in fine points.
 """
 
-OUTPUT_FIELDS = ("measured", "weight", "samples", "fraction", "first", "grid")
+OUTPUT_FIELDS = ("measured", "weight", "samples", "fraction", "first", "grid", "precision")
 """Fields of an output.
 
 Indices of measured values and weights; index (in ints) of each grid point's row, or of the bounds
 of its interval's samples; index of the samples' positions in their interval; first row of the
-predictions; index of the measurement interpolated to the grid.
+predictions; index of the measurement interpolated to the grid; index of the sensor's weight
+at each grid point with a measured value, else 0 (for corrections only).
 """
 
 FLOAT_FIELDS = ("step", "cap", "scale")

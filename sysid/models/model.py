@@ -1,7 +1,7 @@
 """A checked model: equations as trees, parameters, initial states, solver, polynomial terms."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
@@ -204,6 +204,47 @@ class HistoryFunction:
 
 
 @dataclass(frozen=True, slots=True)
+class NoisePlaces:
+    """Places of noise inside the plant, by name: states that diffuse, and signals with loads.
+
+    A load at an input enters the equations, and one at an output is the drift of its sensor.
+    """
+
+    plant: tuple[str, ...] = ()
+    load: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """Changes of states after each sample of an output, whose sensor has the deviation 1/w.
+
+    A state changes by ``gain·w²(y - ŷ)/S`` or by ``-loss·w²/S``, S = 1 + w²·variance. All
+    expressions are functions of parameters and present states, as they are before the sample.
+
+    Attributes
+    ----------
+    output : str
+    variance : Expression
+        Variance of the output that follows from the states.
+    gains, losses : tuple of (str, Expression)
+        By state.
+    """
+
+    output: str
+    variance: Expression
+    gains: tuple[tuple[str, Expression], ...]
+    losses: tuple[tuple[str, Expression], ...]
+
+    def map(self, change: Callable[[Expression], Expression]) -> "Correction":
+        """Return the correction with all expressions changed."""
+        gains, losses = (
+            tuple((state, change(tree)) for state, tree in pairs)
+            for pairs in (self.gains, self.losses)
+        )
+        return Correction(self.output, change(self.variance), gains, losses)
+
+
+@dataclass(frozen=True, slots=True)
 class Solver:
     """Integration method of a differential model, and reading of past values.
 
@@ -239,7 +280,9 @@ class Model:
     `states`) is the order of computation. `memory` is the largest fixed offset of any past value
     (difference form): the first `memory` samples are measured or initial values. `document` is
     the normal form, from which the model can be built again. `histories` are those of states with a
-    history function, in the states' order.
+    history function, in the states' order. `noise` has the places that the document names.
+    `corrections` are those of a Kalman filter (`sysid.models.kalman_filter`), whose states are not
+    in the document.
 
     `terms` are the terms of a polynomial, in the order of their coefficients. With a `rule` they
     are candidates. `sysid.selection.select.select_model_terms` selects among them on records. Its
@@ -263,6 +306,8 @@ class Model:
     rule: TermRule | None = None
     selection: Selection | None = field(default=None, compare=False)
     histories: tuple[HistoryFunction, ...] = ()
+    noise: NoisePlaces = NoisePlaces()
+    corrections: tuple[Correction, ...] = ()
 
     def find_history(self, state: str) -> Expression | None:
         """Find the history function of a state; None if it has none."""

@@ -11,6 +11,7 @@ from sysid.models.model import (
     Model,
     Output,
 )
+from sysid.models.noise_places import write_noise
 from sysid.models.parameters import Parameter
 from sysid.models.sections import AUTO
 
@@ -50,6 +51,7 @@ def to_normal_form(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
         **_write_histories(fields.get("history"), model),
         "initial": AUTO if fields.get("initial") == AUTO else write_starts(model),
         "solver": _write_solver(model),
+        **write_noise(model.noise),
     }
 
 

@@ -21,8 +21,10 @@ from sysid.models.model import (
     Model,
     ModelForm,
     ModelSignal,
+    NoisePlaces,
     Output,
 )
+from sysid.models.noise_places import read_noise
 from sysid.models.normal_form import to_normal_form
 from sysid.models.parameters import Parameter
 from sysid.models.polynomial import POLYNOMIAL_FIELDS as POLYNOMIAL_FIELDS
@@ -54,6 +56,7 @@ _COMMON_FIELDS = (
     "initial",
     "history",
     "solver",
+    "noise",
 )
 _FORMS = ("difference", "differential", "polynomial")
 _FIELDS = {
@@ -194,6 +197,7 @@ def _read_equation_model(
     initial = read_initial_states(reader, fields.get("initial"), scope, FixedInitial(0.0), begun)
     initial = derive_starts(reader, dict(zip(scope.states, initial, strict=True)), histories)
     solver = read_solver(reader, fields.get("solver"), form)
+    noise = _read_noise(reader, fields.get("noise"), scope, trees, outputs)
     reader.raise_faults()
     initial = _solve_steady_starts(reader, initial, trees, scope)
     _check_measured_starts(reader, initial, trees, outputs, scope)
@@ -212,7 +216,25 @@ def _read_equation_model(
         solver=solver,
         document={},
         histories=histories,
+        noise=noise,
     )
+
+
+def _read_noise(
+    reader: DocumentReader,
+    value: object,
+    scope: Scope,
+    trees: tuple[Expression, ...],
+    outputs: tuple[Output, ...],
+) -> NoisePlaces:
+    if value is None:
+        return NoisePlaces()
+    if scope.form != "differential":
+        detail = "belongs to the differential form; a recursion predicts from measured values"
+        reader.add_fault("/noise", detail)
+        return NoisePlaces()
+    equations_of = dict(zip(scope.states, trees, strict=True))
+    return read_noise(reader, value, equations_of, scope.inputs, outputs)
 
 
 def _solve_steady_starts(
@@ -341,6 +363,7 @@ def _read_polynomial_model(reader: DocumentReader, fields: Mapping[str, Any]) ->
     initial = read_initial_states(reader, fields.get("initial"), scope, MeasuredInitial())
     initial = derive_starts(reader, {output.name: initial[0]}, ())
     solver = read_solver(reader, fields.get("solver"), "polynomial")
+    _read_noise(reader, fields.get("noise"), scope, (), ())
     reader.raise_faults()
     named = {parameter.name: get_interval(parameter) for parameter in equation.coefficients}
     whole = replace(scope, parameters={**named, **scope.parameters})

@@ -73,6 +73,9 @@ def apply_ties(model: Model, ties: Ties) -> Model:
             replace(history, expression=_substitute_ties(history.expression, ties))
             for history in model.histories
         ),
+        corrections=tuple(
+            one.map(lambda tree: _substitute_ties(tree, ties)) for one in model.corrections
+        ),
     )
 
 

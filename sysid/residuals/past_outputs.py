@@ -19,6 +19,7 @@ from sysid.language.tree import (
     Unary,
     match_plain_state,
 )
+from sysid.models.kalman_filter import is_noise_parameter
 from sysid.models.model import Model
 from sysid.models.parameters import Parameter
 from sysid.models.ties import apply_ties, resolve_ties
@@ -44,10 +45,14 @@ def count_past_output_coefficients(model: Model, parameters: Sequence[Parameter]
     ----------
     model : Model
     parameters : sequence of Parameter
-        All parameters of a problem. A delay is no coefficient, free or not.
+        All parameters of a problem. A delay is no coefficient, free or not. Those of a filter are
+        counted instead if the model has one.
     """
     model = apply_ties(model, resolve_ties(model, parameters))
     free = {item.name for item in parameters if item.is_free}
+    if model.corrections:
+        noise = sum(map(is_noise_parameter, free))
+        return {output.name: noise for output in model.outputs}
     equations = dict(zip((item.name for item in model.states), model.equations, strict=True))
     counts = {}
     for output in model.outputs:

@@ -181,7 +181,7 @@ def run_residual_tests(
     If the noise of an output has a correlation time (s), its residuals are whitened first.
     """
     series = list_residual_series(problem, simulated, correlation_times)
-    if data == "estimation" and problem.prediction == "one-step":
+    if data == "estimation" and not problem.is_free_run:
         counts = count_past_output_coefficients(problem.model, problem.all_parameters)
         series = [residuals._replace(coefficients=counts[residuals.output]) for residuals in series]
     return judge_tests(compute_correlations(series, both_sides=False), data)

@@ -132,7 +132,7 @@ def estimate_sandwich(
     if clustered is not None:
         return clustered
     pairs = list(_find_correlated_pairs(parts, influence))
-    is_free = problem.prediction == "simulation" or not reads_outputs(problem.model)
+    is_free = problem.is_free_run or not reads_outputs(problem.model)
     are_coloured = [is_free and is_coloured(part, influence[part.rows]) for part in parts]
     are_equal = problem.settings.deviations is None and not have_unequal_variances(
         [influence[part.rows] for part in parts]

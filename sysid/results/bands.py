@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.core.errors import InvalidSettings
-from sysid.core.settings import PredictionKind
+from sysid.core.settings import FoundNoiseModel, Loss, PredictionKind
 from sysid.data.records import Channels, Record, Recording
 from sysid.models.model import Model, name_initial_state, replace_substeps
 from sysid.models.parse import keep_terms
@@ -56,7 +56,9 @@ def compute_bands(
     estimates = [estimate for estimate in found.parameters if estimate.name in shared]
     noise = pool_noise(found.agreement.estimation, spread.noise_degrees)
     compared = replace(record, outputs=tuple(_fill_missing(one) for one in record.outputs))
-    [bands] = compute_fit_bands(model, [compared], estimates, data.ties, spread, noise)
+    [bands] = compute_fit_bands(
+        model, [compared], estimates, data.ties, spread, noise, noise_model="white"
+    )
     return bands
 
 
@@ -84,6 +86,7 @@ def compute_record_bands(
         spread,
         estimate_noise(found.agreement.estimation, spread.noise_degrees),
         data.prediction,
+        noise_model=found.noise_model,
     )
 
 
@@ -116,6 +119,8 @@ def compute_fit_bands(
     spread: ParameterSpread,
     noise: NoiseDeviations,
     prediction: PredictionKind = "simulation",
+    *,
+    noise_model: FoundNoiseModel,
 ) -> tuple[tuple[OutputBands, ...], ...]:
     """Compute the bands on records at some estimates.
 
@@ -125,6 +130,8 @@ def compute_fit_bands(
         With the selected terms and the integration step of the result.
     ties : mapping of str to str
         Expressions of tied parameters that the model does not tie itself.
+    noise_model : FoundNoiseModel
+        That of the result: with noise inside the plant the outputs are predictions.
     """
     own_ties = {parameter.name for parameter in model.parameters if parameter.tied is not None}
     values, changes = dict[str, float](), dict[str, dict[str, Any]]()
@@ -136,7 +143,12 @@ def compute_fit_bands(
             changes[estimate.name] = _write_change(estimate)
     weights = {output.name: 1.0 for output in model.outputs}
     problem = Problem.build(
-        model, records, parameters=changes, prediction=prediction, weights=weights
+        model,
+        records,
+        parameters=changes,
+        prediction=prediction,
+        loss=Loss(noise_model=noise_model if noise_model in ("plant", "load") else "white"),
+        weights=weights,
     )
     theta = np.array([values[name] for name in problem.free_names])
     return compute_output_bands(problem, theta, spread, noise)

@@ -186,6 +186,51 @@ class OrderComparison:
         return tuple(fit for fit in self.fits if fit.is_open)
 
 
+@dataclass(frozen=True, slots=True)
+class NoiseSource:
+    """A source of noise, and its size.
+
+    Attributes
+    ----------
+    place : str
+        The output, input or state where it acts.
+    kind : {"sensor", "plant", "load"}
+        White noise of a sensor, diffusion of a state, or a slow load.
+    deviation : float
+        Standard deviation, in `unit`; of a diffusion that after one second.
+    unit : str
+        Its unit.
+    correlation_time : float or None
+        Correlation time of a load, s.
+    """
+
+    place: str
+    kind: Literal["sensor", "plant", "load"]
+    deviation: float
+    unit: str
+    correlation_time: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class PlantNoise:
+    """Noise inside the plant, and the free run beside the predictions that the result shows.
+
+    Attributes
+    ----------
+    sources : tuple of NoiseSource
+        The sensors, then the noise inside the plant.
+    rms_free : float or None
+        RMS error of the free run with the same estimates, in the unit of the result's `rms`; none
+        if it diverges.
+    fit_free : float or None
+        Its fit, %.
+    """
+
+    sources: tuple[NoiseSource, ...]
+    rms_free: float | None
+    fit_free: float | None
+
+
 def _is_open(fit: OrderFit, best: OrderFit, samples: int) -> bool:
     """Whether the data do not rule out an order, and speak for the parameters that it has more."""
     more = len(fit.values) - len(best.values)

@@ -7,10 +7,9 @@ field of the REST interface, of the client's types and of the saved file.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
 
 from sysid.core.errors import InvalidRecord
-from sysid.core.settings import LossKind, PredictionKind, StartKind
+from sysid.core.settings import FoundNoiseModel, LossKind, PredictionKind, StartKind
 from sysid.core.text import find_rms_unit
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
@@ -20,7 +19,7 @@ from sysid.models.model import Model, SelectedTerm
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import CorrelationFunction, ResidualTests
 from sysid.results.findings import Finding
-from sysid.results.parts import InputHold, OrderComparison, SearchEvidence
+from sysid.results.parts import InputHold, OrderComparison, PlantNoise, SearchEvidence
 from sysid.results.verdict import Verdict
 from sysid.search.state import Improvement, IslandSummary, Migrant
 from sysid.simulation.fit_metrics import ChannelMetrics
@@ -138,7 +137,7 @@ class Result:
     noise_colour : NoiseColour or None
         Colour of the residuals that the errors assume. If they drift over the whole record, the
         errors are lower bounds.
-    noise_model : {"white", "ar1"}
+    noise_model : {"white", "ar1", "plant", "load"}
         Noise model of the estimates.
     correlation_times : mapping of str to float
         Correlation time of each output's noise, s, where the noise model has one.
@@ -178,6 +177,9 @@ class Result:
         Selected terms; empty if none were to be selected.
     initial : StartKind or None
         Start of the states that the estimates assume; none: as the model's document says.
+    plant_noise : PlantNoise or None
+        Sizes of the noise, and the free run, if noise acts inside the plant. Then `rms`, fits and
+        signals are those of predictions one sample ahead.
     """
 
     valid: bool
@@ -194,7 +196,7 @@ class Result:
     correlation: CorrelationMatrix | None
     noise_sd: float | None
     noise_colour: NoiseColour | None
-    noise_model: Literal["white", "ar1"]
+    noise_model: FoundNoiseModel
     correlation_times: Mapping[str, float]
     noise_deviations: tuple[tuple[float, ...], ...] | None
     residual_tests: ResidualTests
@@ -213,6 +215,7 @@ class Result:
     substeps: int
     selection: tuple[SelectedTerm, ...]
     initial: StartKind | None = None
+    plant_noise: PlantNoise | None = None
 
     @property
     def parameter_values(self) -> dict[str, float]:

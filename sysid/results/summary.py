@@ -17,7 +17,7 @@ from sysid.core.text import (
 )
 from sysid.core.value_documents import list_fields
 from sysid.results.findings import list_untold_reasons
-from sysid.results.parts import OrderComparison, SearchEvidence
+from sysid.results.parts import OrderComparison, PlantNoise, SearchEvidence
 from sysid.results.result import FullResult, Result, find_output_unit
 from sysid.uncertainty.estimates import Estimate
 
@@ -98,8 +98,10 @@ def _list_columns(estimate: Estimate) -> Iterator[tuple[str, object]]:
 
 
 def list_evidence(result: Result) -> list[str]:
-    """List the evidence beside the findings: residual tests, and the order if none tells it."""
+    """List the evidence beside the findings: residual tests, noise, the order if none tells it."""
     evidence = [describe_residuals(result)] if result.residual_tests.passed is not None else []
+    if result.plant_noise is not None:
+        evidence.append(describe_noise(result.plant_noise))
     if result.order_comparison is not None and not any(
         one.severity != "note" or one.explanation == "order" for one in result.findings
     ):
@@ -123,6 +125,17 @@ def describe_residuals(result: Result) -> str:
     if failed and result.verdict.trust == "trustworthy":
         outcome += "; no explanation of that moves an estimate" if result.explained else ", weakly"
     return f"residuals on {tests.data} data: {outcome}"
+
+
+def describe_noise(noise: PlantNoise) -> str:
+    """Say how large each source of noise is, and how well the free run fits."""
+    sources = [
+        f"{one.kind} at {one.place} {one.deviation:.2g}{plain_unit(one.unit)}"
+        + ("" if one.correlation_time is None else f" with {one.correlation_time:.2g} s")
+        for one in noise.sources
+    ]
+    free = "diverges" if noise.fit_free is None else f"fits {noise.fit_free:.1f} %"
+    return f"noise: {', '.join(sources)}; the free run {free}"
 
 
 def describe_search(evidence: SearchEvidence) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from sysid.core.types import FloatArray
 from sysid.core.units import divide_units, is_blank_unit
 from sysid.data.records import Channel, Record
+from sysid.models.kalman_filter import NoiseScales
 from sysid.models.parameters import RATE_UNIT, BoundsRule, Parameter
 
 Interval = tuple[float, float]
@@ -109,6 +110,19 @@ def _find_common_unit(channels: Iterable[Channel]) -> str | None:
     """Find the unit that channels share; None if they have none, or several."""
     units = {channel.unit for channel in channels if not is_blank_unit(channel.unit)}
     return units.pop() if len(units) == 1 else None
+
+
+def measure_noise_scales(records: Sequence[Record]) -> NoiseScales:
+    """Measure what bounds the noise of a plant."""
+    measured: dict[str, list[FloatArray]] = {}
+    for record in records:
+        for channel in (*record.inputs, *record.outputs):
+            measured.setdefault(channel.name, []).append(_drop_missing(channel).values)
+    values = {name: np.concatenate(parts) for name, parts in measured.items()}
+    spans = {name: float(np.ptp(one)) for name, one in values.items() if one.size}
+    outputs = [channel for record in records for channel in record.outputs]
+    period = min(_find_period(_drop_missing(channel)) for channel in outputs)
+    return NoiseScales(spans, period, min(record.stop - record.start for record in records))
 
 
 def _choose_interval(rule: BoundsRule, spans: _Spans, has_offset: bool) -> Interval:

@@ -39,6 +39,8 @@ class Evaluator(NamedTuple):
         Length of the work array that a call of the kernel needs.
     n_measured : int
         M, measured values over all experiments and outputs.
+    n_stored : int
+        M, or 2M if measurements correct the states: predictions and deviations of innovations.
     weight : FloatArray, shape (M,)
         Square root of each measured value's weight; 0 where it is not scored or missing.
     measured : FloatArray, shape (M,)
@@ -58,12 +60,14 @@ class Evaluator(NamedTuple):
     floats: FloatArray
     n_work: int
     n_measured: int
+    n_stored: int
     weight: FloatArray
     measured: FloatArray
     n_scored: float
 
 
 _LAST_STEP = HEAD_FIELDS.index("last")
+_LARGE = 1e100  # product of deviations whose logarithm is taken
 
 
 @compile_borrowing
@@ -85,7 +89,7 @@ def expand_individuals(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
 def _run_kernels(
     evaluator: Evaluator, ints: IntArray, full: FloatArray, predictions: FloatArray
 ) -> FloatArray:
-    loss = np.zeros(full.shape[1])
+    loss = np.zeros((max(evaluator.n_stored // max(evaluator.n_measured, 1), 1), full.shape[1]))
     if full.shape[1] == 0:
         return loss
     work = np.empty(evaluator.n_work)
@@ -107,24 +111,68 @@ def _run_kernels(
 
 @compile_borrowing
 def evaluate_population(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
-    """Compute J of each individual (Eq. 10): (P, D) → (P,), inf if diverged. Smaller is better."""
+    """Compute J of each individual (Eq. 10): (P, D) → (P,), inf if diverged. Smaller is better.
+
+    If measurements correct the states, J = √(Σ w²e²/S / n · Π S^(1/n)).
+    """
     loss = _run_kernels(
         evaluator, evaluator.ints, expand_individuals(evaluator, theta), np.empty((0, 1))
     )
     fitness = np.empty(theta.shape[0])
     for p in range(theta.shape[0]):
-        value = np.sqrt(loss[p] / evaluator.n_scored)
+        value = np.sqrt(loss[0, p] / evaluator.n_scored)
+        if loss.shape[0] > 1:
+            value *= np.exp(0.5 * loss[1, p] / evaluator.n_scored)
         fitness[p] = value if np.isfinite(value) else np.inf
     return fitness
 
 
 @compile_borrowing
 def predict_population(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
-    """Simulate the values at the measured times: (P, D) → (P, M), not finite where it diverges."""
+    """Simulate the values at the measured times: (P, D) → (P, M), not finite where it diverges.
+
+    If measurements correct the states, the errors of these values are standardised innovations.
+    """
     full = expand_individuals(evaluator, theta)
-    predictions = np.empty((evaluator.n_measured, full.shape[1]))
+    predictions = np.empty((evaluator.n_stored, full.shape[1]))
+    _run_kernels(evaluator, evaluator.ints, full, predictions)
+    _standardise(evaluator, predictions, theta.shape[0])
+    return np.ascontiguousarray(predictions[: evaluator.n_measured, : theta.shape[0]].T)
+
+
+@compile_borrowing
+def predict_ahead(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+    """Predict the measured values as they are, and the deviations √S: (P, D) → (P, M or 2M)."""
+    full = expand_individuals(evaluator, theta)
+    predictions = np.empty((evaluator.n_stored, full.shape[1]))
     _run_kernels(evaluator, evaluator.ints, full, predictions)
     return np.ascontiguousarray(predictions[:, : theta.shape[0]].T)
+
+
+@compile_borrowing
+def _standardise(evaluator: Evaluator, predictions: FloatArray, individuals: int) -> None:
+    """Divide innovations by their deviations over the geometric mean, in place, where scored.
+
+    Then the sum of their squares is exp(-2/n times the logarithm of the likelihood), up to a
+    factor, for the most likely variance of the sensor (Ansley, Biometrika 66 (1979) 59). Samples
+    that were not reached have a deviation of 0, and do not count.
+    """
+    n = evaluator.n_measured
+    if evaluator.n_stored == n:
+        return
+    for p in range(individuals):
+        count, total, product = 0, 0.0, 1.0
+        for m in range(n):
+            if evaluator.weight[m] != 0.0 and predictions[n + m, p] != 0.0:
+                product *= predictions[n + m, p]
+                count += 1
+                if not product < _LARGE:
+                    total, product = total + np.log(product), 1.0
+        mean = np.exp((total + np.log(product)) / max(count, 1))
+        for m in range(n):
+            if evaluator.weight[m] != 0.0 and predictions[n + m, p] != 0.0:
+                error = predictions[m, p] - evaluator.measured[m]
+                predictions[m, p] = evaluator.measured[m] + error * (mean / predictions[n + m, p])
 
 
 @compile_borrowing
@@ -139,6 +187,8 @@ def predict_partially(evaluator: Evaluator, theta: FloatArray, horizon: float) -
         last = evaluator.offsets[e, 0] + _LAST_STEP
         ints[last] = int(np.ceil(horizon * ints[last]))
     full = expand_individuals(evaluator, theta)
-    predictions = np.empty((evaluator.n_measured, full.shape[1]))
+    predictions = np.empty((evaluator.n_stored, full.shape[1]))
+    predictions[evaluator.n_measured :] = 0.0
     _run_kernels(evaluator, ints, full, predictions)
-    return predictions
+    _standardise(evaluator, predictions, theta.shape[0])
+    return predictions[: evaluator.n_measured]

@@ -38,6 +38,8 @@ class OutputSamples:
     weights: FloatArray
     grid_values: FloatArray
     """The measurement interpolated to the grid points; empty where it is not needed."""
+    precision: FloatArray
+    """Weight of the sensor where a value was measured, scored or not, else 0."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,6 +145,7 @@ def pack_experiment(
     first_inputs: Sequence[float],
     largest_delay_steps: float,
     scale: float,
+    n_measured: int,
 ) -> PackedExperiment:
     """Pack one experiment into the arrays of a kernel.
 
@@ -154,6 +157,8 @@ def pack_experiment(
         Largest delay of a state, in integration steps.
     scale : float
         Scale of the soft-l1 loss.
+    n_measured : int
+        M, measured values of all experiments.
     """
     builder = _ArrayBuilder(ExperimentLayout.from_model(model))
     cap = ceil(
@@ -161,7 +166,7 @@ def pack_experiment(
     )  # a delay rounded to whole steps may exceed its bound by part of one
     reach = cap + find_furthest_offset(model) + 5
     rows = max(min(grid.last_step + reach + 3, 2 * reach + _HISTORY_SLACK), 2 * reach + 3)
-    builder.ints[:3] = [grid.last_step, reach, rows]
+    builder.ints[:4] = [grid.last_step, reach, rows, n_measured]
     builder.floats[:3] = [grid.integration_step, cap, scale]
     for i, start in enumerate(starts):
         builder.floats[builder.layout.locate_initial(i)] = start.first_values[0]
@@ -188,6 +193,10 @@ def pack_experiment(
         builder.write_entries(
             "output", i, first=first, grid=builder.add_floats(samples.grid_values)
         )
+        if model.corrections:
+            precision = np.zeros(grid.points)
+            precision[samples.positions.astype(np.int64)] = samples.precision
+            builder.write_entries("output", i, precision=builder.add_floats(precision))
         first += samples.positions.size
     columns = sum(history.columns for history in list_stored_histories(model))
     n_work = max(columns * rows * LANES, 1)

@@ -307,9 +307,13 @@ def _make_samples(
     model: Model, grid: Grid, channel: Channel, weight: float, skip: int, scored_from: float
 ) -> OutputSamples:
     weights = np.where(_is_scored(channel, skip, scored_from), weight, 0.0)
-    values = np.where(np.isfinite(channel.values), channel.values, 0.0)
+    is_known = np.isfinite(channel.values)
     return OutputSamples(
-        locate_samples(grid, model, channel), values, weights, _interpolate_to_grid(grid, channel)
+        locate_samples(grid, model, channel),
+        np.where(is_known, channel.values, 0.0),
+        weights,
+        _interpolate_to_grid(grid, channel),
+        np.where(is_known, weight, 0.0),
     )
 
 
@@ -323,11 +327,13 @@ def _replace_samples(
 ) -> OutputSamples:
     """Replace the values of samples; weights that are equal remain the same array."""
     weights = np.where(_is_scored(channel, skip, scored_from), weight, 0.0)
+    is_known = np.isfinite(channel.values)
     return OutputSamples(
         samples.positions,
-        np.where(np.isfinite(channel.values), channel.values, 0.0),
+        np.where(is_known, channel.values, 0.0),
         samples.weights if np.array_equal(weights, samples.weights) else weights,
         _interpolate_to_grid(grid, channel),
+        np.where(is_known, weight, 0.0),
     )
 
 

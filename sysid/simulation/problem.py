@@ -15,13 +15,23 @@ from sysid.data.records import Record
 from sysid.kernels.compilation.build import get_kernel_address
 from sysid.kernels.layout import KernelVariant
 from sysid.kernels.signals.past_reads import list_delaying_inputs
+from sysid.models.kalman_filter import add_kalman_filter, find_plant_noise
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.model_delays import check_delays
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.starts import replace_starts
 from sysid.models.ties import Ties, apply_ties, resolve_ties
-from sysid.simulation.data_bounds import add_units_of_data, bound_by_data
-from sysid.simulation.evaluator import Evaluator, evaluate_population, predict_population
+from sysid.simulation.data_bounds import (
+    add_units_of_data,
+    bound_by_data,
+    measure_noise_scales,
+)
+from sysid.simulation.evaluator import (
+    Evaluator,
+    evaluate_population,
+    predict_ahead,
+    predict_population,
+)
 from sysid.simulation.experiment_arrays import (
     PackedExperiment,
     are_on_grid,
@@ -161,6 +171,10 @@ class Problem:
                 f"found {len(scoring_starts)} times for {len(records)} records. Need one each",
             )
         given, model = model, replace_starts(model, settings.initial)
+        noise = find_plant_noise(model, settings.loss.noise_model)
+        if noise is not None:
+            settings = replace(settings, loss=replace(settings.loss, noise_model=noise))
+            model = add_kalman_filter(model, noise, measure_noise_scales(records))
         declared = (*model.parameters, *build_initial_parameters(model, len(records)))
         bounded = bound_by_data(add_units_of_data(declared, records), records)
         all_parameters = override_parameters(bounded, settings.parameters)
@@ -220,6 +234,11 @@ class Problem:
         return self.settings.prediction
 
     @property
+    def is_free_run(self) -> bool:
+        """Whether outputs follow from the inputs alone, and not from outputs measured before."""
+        return self.settings.prediction == "simulation" and not self.model.corrections
+
+    @property
     def loss(self) -> Loss:
         """Loss that is minimised."""
         return self.settings.loss
@@ -255,7 +274,7 @@ class Problem:
 
         If runs differ in their noise only, most of the work is done once.
         """
-        if any(parameter.bounds for parameter in self.all_parameters):
+        if any(p.bounds for p in self.all_parameters) or self.model.corrections:
             return self.rebuild(records=records)  # bounds follow the noise too
         skip, scoring_starts = self.settings.skip, self.settings.scored_from
         per_output = compute_output_weights(self.model, records, self.settings.weights, skip)
@@ -359,6 +378,18 @@ class Problem:
         return predict_population(
             self.evaluator, _check_population(theta, len(self.free_parameters))
         )
+
+    def predict_ahead(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Predict the measured values from those before, with their deviations: (P, M) each.
+
+        A deviation is that of the innovation over the sensor's. Without a filter the values are
+        those of `predict`, and the deviations 1.
+        """
+        if not self.model.corrections:
+            simulated = self.predict(theta)
+            return simulated, np.ones_like(simulated)
+        values = predict_ahead(self.evaluator, _check_population(theta, len(self.free_parameters)))
+        return values[:, : self.evaluator.n_measured], values[:, self.evaluator.n_measured :]
 
     def compute_residuals(self, theta: FloatArray) -> FloatArray:
         """Compute the weighted residuals w(ŷ - y) of the scored samples, (P, D) → (P, n)."""
@@ -534,10 +565,18 @@ def _build_evaluator(
     settings: FitSettings,
 ) -> Evaluator:
     on_grid = all(are_on_grid(experiment.outputs) for experiment in experiments)
+    if model.corrections and not on_grid:
+        raise InvalidSettings(
+            "/loss/noise_model",
+            "noise inside the plant needs regular samples. Resample the record, or set "
+            "/solver/step of the model to a period that all sample times are multiples of",
+        )
     weighted = any(has_weights(e.outputs, e.grid, on_grid) for e in experiments)
     loss = settings.loss
     one_step, is_robust = settings.prediction == "one-step", loss.kind == "soft-l1"
     variant = KernelVariant(one_step, is_robust, on_grid, weighted)
+    samples = [samples for e in experiments for samples in e.outputs]
+    weight = np.concatenate([s.weights for s in samples])
     packed = [
         pack_experiment(
             model,
@@ -549,13 +588,12 @@ def _build_evaluator(
             e.first_inputs,
             e.largest_delay_steps,
             loss.scale,
+            weight.size,
         )
         for e in experiments
     ]
     rows = [i for i, parameter in enumerate(parameters) if parameter.is_free]
     free = [parameters[i] for i in rows]
-    samples = [samples for e in experiments for samples in e.outputs]
-    weight = np.concatenate([s.weights for s in samples])
     return Evaluator(
         kernel=get_kernel_address(model, variant),
         template=np.array([p.lower if p.fixed is None else p.fixed for p in parameters]),
@@ -568,6 +606,7 @@ def _build_evaluator(
         floats=np.concatenate([experiment.floats for experiment in packed]),
         n_work=max(experiment.n_work for experiment in packed),
         n_measured=weight.size,
+        n_stored=(2 if model.corrections else 1) * weight.size,
         weight=weight,
         measured=np.concatenate([s.values for s in samples]),
         n_scored=max(float(np.count_nonzero(weight)), 1.0),

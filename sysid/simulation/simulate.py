@@ -20,6 +20,7 @@ from sysid.data.table_rules import TimeAxis, split_headings
 from sysid.language.evaluation import evaluate_expression as value_of
 from sysid.models.catalogue.load import ModelSource, resolve_model
 from sysid.models.channel_assignment import name_inputs
+from sysid.models.kalman_filter import is_noise_parameter
 from sysid.models.model import (
     DerivedInitial,
     FixedInitial,
@@ -222,7 +223,8 @@ def _restore(
         for channel in inputs
     )
     others = re.compile(r".*\(0\)\[\d+\]")
-    return model, held, {k: v for k, v in numbers.items() if not others.fullmatch(k)}
+    kept = {k: v for k, v in numbers.items() if not (others.fullmatch(k) or is_noise_parameter(k))}
+    return model, held, kept
 
 
 def _choose_times(inputs: tuple[Channel, ...], times: ArrayLike | None) -> TimeAxis:

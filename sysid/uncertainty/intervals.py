@@ -15,6 +15,8 @@
 `Mixture`
     Alternatives with their weights, such as other explanations of the residuals (Bayesian model
     averaging; Hoeting, Madigan, Raftery and Volinsky, Statist. Sci. 14 (1999) 382).
+`AverageOverNoise`
+    The same over sizes of noise inside the plant (`sysid.uncertainty.noise_sizes`).
 """
 
 from abc import abstractmethod
@@ -273,6 +275,25 @@ class Mixture:
         pairs = (estimate.interval95, compute_mixture_interval(self.alternatives))
         lower, upper = zip(*pairs, strict=True)
         return replace(estimate, interval95=(min(lower), max(upper)))
+
+
+@dataclass(frozen=True, slots=True)
+class AverageOverNoise:
+    """Estimates by sizes of the noise inside the plant, which are never known exactly."""
+
+    alternatives: tuple[Alternative, ...]
+
+    def apply(self, estimate: Estimate) -> Estimate:
+        """Extend the interval by that of the average, and the standard error to its deviation."""
+        if estimate.stderr is None or estimate.interval95 is None:
+            return estimate
+        total = sum(one.weight for one in self.alternatives)
+        mean = sum(one.weight * one.value for one in self.alternatives) / total
+        variance = sum(
+            one.weight * (one.stderr**2 + (one.value - mean) ** 2) for one in self.alternatives
+        )
+        stderr = max(estimate.stderr, sqrt(variance / total))
+        return Mixture(self.alternatives).apply(replace(estimate, stderr=stderr))
 
 
 def compute_mixture_interval(alternatives: Sequence[Alternative]) -> Interval:

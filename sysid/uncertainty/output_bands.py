@@ -85,7 +85,7 @@ def compute_output_bands(
     The free parameters of the problem are among those of the spread.
     """
     columns = [spread.names.index(name) for name in problem.free_names]
-    simulated = problem.predict(theta[None])[0]
+    simulated = problem.predict_ahead(theta[None])[0][0]
     quantile, noise_quantile = (
         student_limit(max(degrees, 1.0), 0.025)
         for degrees in (spread.degrees, spread.noise_degrees)

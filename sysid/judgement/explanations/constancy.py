@@ -68,7 +68,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
                 describe=_describe_drift(context, number, float(scale[number])),
                 varies=(number, -0.5, 0.5),
             )
-    if not is_lag_a_clock and context.problem.prediction == "simulation":
+    if not is_lag_a_clock and context.problem.is_free_run:
         for at, late, moment in context.find_breaks(clock):
             yield Candidate(
                 "jump of a clock",

@@ -22,7 +22,7 @@ _SPANS = 4  # of the time that lags reach back before the record
 def propose(context: ResidualContext) -> Iterator[Candidate]:
     """Propose another input before the record, and other starts."""
     problem = context.problem
-    if problem.prediction != "simulation":
+    if not problem.is_free_run:
         return
     inputs = list(_propose_inputs(context))
     yield from inputs

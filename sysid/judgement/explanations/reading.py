@@ -17,7 +17,7 @@ from sysid.kernels.signals.past_reads import is_difference
 
 def propose(context: ResidualContext) -> Iterator[Candidate]:
     """Propose other readings of inputs and outputs."""
-    if is_difference(context.problem.model) or context.problem.prediction != "simulation":
+    if is_difference(context.problem.model) or not context.problem.is_free_run:
         return  # predictions know the noise of their samples
     for channel in context.moving_inputs:
         name = channel.name

@@ -35,7 +35,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             counted=1,
             is_vague=True,
         )
-    if context.problem.prediction == "simulation":  # predictions know the noise of their samples
+    if context.problem.is_free_run:  # predictions know the noise of their samples
         yield from _propose_zero(context)
     columns = list(_list_past_inputs(context))
     if columns:
@@ -99,11 +99,15 @@ def _differentiate(context: ResidualContext) -> FloatArray:
 
 
 def _list_past_inputs(context: ResidualContext) -> Iterator[FloatArray]:
-    """List columns (n,) of past values of each input that moves."""
+    """List columns (n,) of past values of each input that moves.
+
+    A controller computes the present value from the output's, noise included. So predictions from
+    measured outputs have no column of it.
+    """
     longest = max(part.times.size for part in context.parts)
     most = context.times.size // (_SAMPLES_PER_LAG * max(len(context.moving_inputs), 1))
     spaced = np.geomspace(1.0, max(longest / 4, 1.0), min(_LAGS, max(most, 1)))
-    lags = np.unique(spaced.astype(np.int64)) - 1
+    lags = np.unique(spaced.astype(np.int64)) - (0 if context.problem.model.corrections else 1)
     for channel in context.moving_inputs:
         for lag in lags.tolist():
             column = context.read_input(channel.name, lag)

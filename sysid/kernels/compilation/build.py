@@ -69,6 +69,7 @@ def compute_kernel_key(model: Model, variant: KernelVariant) -> str:
         model.equations,
         starts,
         model.histories,
+        model.corrections,
         model.order,
         model.memory,
         replace(model.solver, step=None),

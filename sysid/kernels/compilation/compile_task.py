@@ -10,6 +10,7 @@ from typing import Any
 from sysid.kernels.layout import KernelVariant
 from sysid.language.tree import Binary, FunctionCall, Number, PastValue, Symbol, Unary
 from sysid.models.model import (
+    Correction,
     DerivedInitial,
     EstimatedInitial,
     FixedInitial,
@@ -17,6 +18,7 @@ from sysid.models.model import (
     MeasuredInitial,
     Model,
     ModelSignal,
+    NoisePlaces,
     Output,
     Solver,
 )
@@ -47,6 +49,8 @@ _TYPES = {
         MeasuredInitial,
         DerivedInitial,
         HistoryFunction,
+        NoisePlaces,
+        Correction,
         Number,
         Symbol,
         PastValue,

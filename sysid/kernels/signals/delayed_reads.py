@@ -168,7 +168,7 @@ class LinearReader:
 class DirectReader:
     """Interpolation of a state that is read again in every step.
 
-    It serves one-step prediction, which changes samples after they were read, steps that are
+    It serves predictions, which change samples after they were read, steps that are
     divided at switches in time, and cubic interpolation where there are no slopes. Cubic then means
     Lagrange through four samples. Where later samples do not exist yet, it uses three samples, or a
     line inside the present step.

@@ -152,6 +152,12 @@ def _list_states_with_history(model: Model) -> list[str]:
     return [state.name for state in model.states if state.name in needed]
 
 
+def corrects_past(model: Model) -> bool:
+    """Whether measurements correct a state that is also read in the past."""
+    corrected = {state for one in model.corrections for state, _ in one.gains}
+    return not corrected.isdisjoint(stored.state for stored in list_stored_histories(model))
+
+
 def count_register_samples(model: Model, state: str) -> int:
     """Count the finished samples of a state in registers, besides the last."""
     fixed = [

@@ -27,7 +27,7 @@ class SignalReaders:
         experiment: ExperimentHead,
         states: States,
         delays: Delays,
-        one_step: bool,
+        changes_past: bool,
     ) -> None:
         self._lanes, self._model, self._experiment = lanes, model, experiment
         self._delays, self._states = delays, states
@@ -46,7 +46,7 @@ class SignalReaders:
                 reader = DirectReader(lanes, history, delay, set(), cubic)
                 self._part_readers[past] = reader
                 self._owners.append((past[0], reader))
-            if one_step or cubic:
+            if changes_past or cubic:
                 self._add_reader(
                     past, positions, DirectReader(lanes, history, delay, positions, cubic)
                 )

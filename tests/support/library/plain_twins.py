@@ -92,12 +92,24 @@ _OPERATORS = {
 
 
 def predictions(problem: Problem, theta: FloatArray, one_step: bool = False) -> FloatArray:
-    """Simulated values (M,) of one individual (D,)."""
+    """Simulated values (M,) of one individual (D,), their errors standardised by a filter."""
+    values, deviations = predictions_ahead(problem, theta, one_step)
+    weight, measured = problem.evaluator.weight, problem.evaluator.measured
+    mean = np.exp(np.mean(np.log(deviations[weight > 0])))
+    standard = measured + (values - measured) * mean / deviations
+    return np.where((weight > 0) & (deviations != mean), standard, values)
+
+
+def predictions_ahead(
+    problem: Problem, theta: FloatArray, one_step: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Simulated values (M,) of one individual (D,), and deviations of their innovations."""
     free = iter(theta)
     values = {
         p.name: float(next(free)) if p.is_free else p.fixed or 0.0 for p in problem.all_parameters
     }
     parts: list[FloatArray] = []
+    deviations: list[FloatArray] = []
     with np.errstate(all="ignore"):
         for e, experiment in enumerate(problem.experiments):
             twin = ModelTwin(problem.model, experiment, e, values, one_step)
@@ -105,14 +117,17 @@ def predictions(problem: Problem, theta: FloatArray, one_step: bool = False) -> 
             for i, samples in enumerate(experiment.outputs):
                 places = np.arange(experiment.grid.points)
                 parts.append(np.interp(samples.positions, places, grid[i]))
-    return np.concatenate(parts)
+                spread = np.array(twin.deviations[i :: len(experiment.outputs)])
+                deviations.append(np.interp(samples.positions, places, spread))
+    return np.concatenate(parts), np.concatenate(deviations)
 
 
 def fitness(problem: Problem, theta: FloatArray) -> float:
     """J of one individual (Eq. 10), by squares."""
     weight, measured = problem.evaluator.weight, problem.evaluator.measured
     error = weight * (predictions(problem, theta) - measured)
-    return float(np.sqrt(np.sum(error**2) / np.count_nonzero(weight)))
+    value = float(np.sqrt(np.sum(error**2) / np.count_nonzero(weight)))
+    return value if np.isfinite(value) else np.inf
 
 
 class ModelTwin:
@@ -132,6 +147,7 @@ class ModelTwin:
         self.step = experiment.grid.integration_step
         self.names = [state.name for state in model.states]
         self.started = False
+        self.deviations: list[float] = []
         nodes = dict.fromkeys(node for equation in model.equations for node in walk(equation))
         self.timely = [node for node in nodes if mentions_time(node)]
         self.past: dict[str, list[float]] = {}
@@ -159,19 +175,34 @@ class ModelTwin:
         grid, found = self.experiment.grid, []
         for m in range(grid.last_step + 1):
             if m % grid.substeps == 0:
-                now = self._now()
-                found.append(
-                    [
-                        self._value(output.expression, m, 0.0, now, -1)
-                        for output in self.model.outputs
-                    ]
-                )
+                found.append([self._compare(i, m) for i in range(len(self.model.outputs))])
                 if self.one_step:
                     self._replace(m // grid.substeps)
             if m < grid.last_step:
                 for name, value in self._next(m).items():
                     self.past[name].append(value)
         return np.array(found).T
+
+    def _compare(self, i: int, m: int) -> float:
+        """An output, whose sample then corrects the states."""
+        now, output = self._now(), self.model.outputs[i]
+        value = self._value(output.expression, m, 0.0, now, -1)
+        samples = self.experiment.outputs[i]
+        places = samples.positions * self.experiment.grid.substeps == m
+        weight = float(np.sum(samples.precision[places]))
+        variance = 1.0
+        for one in self.model.corrections:
+            if one.output == output.name and weight:
+                variance += weight**2 * self._value(one.variance, m, 0.0, now, -1)
+                innovation = float(samples.values[places][0]) - value
+                for state, tree in one.gains:
+                    gain = self._value(tree, m, 0.0, now, -1) * weight**2 / variance
+                    self.past[state][-1] += gain * innovation
+                for state, tree in one.losses:
+                    loss = self._value(tree, m, 0.0, now, -1) * weight**2 / variance
+                    self.past[state][-1] -= loss
+        self.deviations.append(float(np.sqrt(variance)))
+        return value
 
     def _now(self) -> dict[str, float]:
         return {name: past[-1] for name, past in self.past.items()}

@@ -4,6 +4,7 @@ import re
 
 from sysid.language.functions import FUNCTIONS
 from sysid.models.document_reader import parse_yaml
+from sysid.models.model import NoisePlaces
 from sysid.models.parse import parse_model
 from tests.support.checkout import ROOT
 
@@ -24,13 +25,23 @@ FIELDS = (
     "outputs",
     "initial",
     "history",
+    "noise",
 )
 
 
 def test_the_example_of_the_page_is_a_model() -> None:
-    whole, growth, part = re.findall(r"```yaml\n(.*?)```", PAGE, re.S)
+    whole, growth, noise, part = re.findall(r"```yaml\n(.*?)```", PAGE, re.S)
     assert parse_model(parse_yaml(whole)).name == "valve-and-oven"
     assert parse_model(parse_yaml(growth)).find_history("x") is not None
+    line = {
+        "name": "line",
+        "form": "differential",
+        "inputs": {"u": "1"},
+        "states": {"x": "1"},
+        "equations": {"x": "u(t) - x"},
+        "outputs": {"y": "x"},
+    }
+    assert parse_model(line | parse_yaml(noise)).noise == NoisePlaces(("x",), ("u",))
     names = ("k", "E", "V", "F", "tau", "H")
     rest = {
         "name": "reactor",

@@ -6,7 +6,7 @@ from typing import Any
 from sysid.residuals.residual_tests import ResidualTest, ResidualTests
 from sysid.results.findings import Finding, list_untold_reasons, note
 from sysid.results.identification import Identification
-from sysid.results.parts import OrderFit, compare_fits
+from sysid.results.parts import NoiseSource, OrderFit, PlantNoise, compare_fits
 from sysid.results.summary import describe_order, list_evidence, summarise_result
 from sysid.results.verdict import Verdict
 from tests.support.storage.run_results import conclude
@@ -70,3 +70,14 @@ def test_a_search_that_did_not_settle_is_told_by_its_finding() -> None:
     assert "the search settled: 5 of 10 independent starts ended here" in repr(found)
     restless = replace(found, search=replace(found.search, settled=False, because=None))
     assert "independent starts" not in repr(restless)
+
+
+def test_sources_of_noise_stand_beside_the_free_run() -> None:
+    sensor = NoiseSource("y", "sensor", 0.02, "K", None)
+    load = NoiseSource("u", "load", 0.05, "1", 20.0)
+    told = "noise: sensor at y 0.02 K, load at u 0.05 with 20 s; the free run"
+    noise = PlantNoise((sensor, load), 0.3, 91.04)
+    assert f"{told} fits 91.0 %" in list_evidence(find(plant_noise=noise))
+    assert f"{told} diverges" in list_evidence(
+        find(plant_noise=PlantNoise((sensor, load), None, None))
+    )

@@ -1,0 +1,140 @@
+"""Plants with noise inside them: a load, a drifting sensor, a loop, and an unstable plant."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sysid.core.settings import GeneticAlgorithm, Loss, Stop
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.export.export import export_model
+from sysid.identification.identify import identify
+from sysid.models.catalogue.load import load_model
+from sysid.models.parse import parse_model
+from sysid.results.identification import Identification
+from sysid.simulation.simulate import simulate
+
+PERIOD, GAIN, CONSTANT, LAG, SENSOR = 0.25, 2.0, 12.3, 4.25, 0.02
+TRUTH = {"K": GAIN, "T": CONSTANT, "L": LAG}
+QUICK = GeneticAlgorithm(population=32, stop=Stop(evaluations=20_000))
+
+
+def make_record(load: float, correlation: float, walk: float = 0.0, seed: int = 5) -> Record:
+    """First order with a dead time of whole samples; a load at its input; its sensor may drift."""
+    random, n = np.random.default_rng(seed), 600
+    u = np.repeat(random.integers(0, 2, n // 40), 40) * 1.0
+    u[:40] = 0.0
+    keep, decay = np.exp(-PERIOD / CONSTANT), np.exp(-PERIOD / correlation)
+    x, d, y = 0.0, load * random.normal(), np.empty(n)
+    for k in range(n):
+        y[k] = x + SENSOR * random.normal()
+        held = u[max(k - round(LAG / PERIOD), 0)]
+        x = keep * x + GAIN * (1 - keep) * (held + d)
+        d = decay * d + load * np.sqrt(1 - decay**2) * random.normal()
+    y += np.cumsum(walk * random.normal(size=n))
+    return build_record(u, y)
+
+
+def build_record(u: FloatArray, y: FloatArray) -> Record:
+    times = PERIOD * np.arange(u.size)
+    return Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y + 20.0),))
+
+
+def test_a_load_is_told_and_the_plant_is_found() -> None:
+    found = identify("fopdt", make_record(0.1, 20.0), QUICK, loss=Loss(noise_model="load"))
+    for name, true in TRUTH.items():
+        low, high = found[name].interval95 or (np.nan, np.nan)
+        assert low <= true <= high, name
+    assert found.noise_model == "load"
+    assert found.noise_colour == "white"
+    assert found.plant_noise is not None
+    sensor, load = found.plant_noise.sources
+    assert (sensor.place, sensor.kind, sensor.unit) == ("y", "sensor", "1")
+    assert sensor.deviation == pytest.approx(SENSOR, rel=0.15)
+    assert (load.place, load.kind) == ("u", "load")
+    assert load.deviation == pytest.approx(0.1, rel=0.7)
+    assert load.correlation_time == found["tau[u]"].value
+    assert found.plant_noise.rms_free is not None
+    assert found.plant_noise.rms_free > 2.0 * found.rms
+
+
+def test_gaps_and_a_start_leave_the_likelihood_exact() -> None:
+    record = make_record(0.1, 20.0)
+    y = record.outputs[0].values.copy()
+    y[200:260] = np.nan
+    y[np.random.default_rng(0).random(y.size) < 0.3] = np.nan
+    gaps = replace(record, outputs=(replace(record.outputs[0], values=y),))
+    found = identify("fopdt", gaps, QUICK, loss=Loss(noise_model="load"))
+    for name, true in TRUTH.items():
+        low, high = found[name].interval95 or (np.nan, np.nan)
+        assert low <= true <= high, name
+    assert np.isfinite(found.simulated[0][0]).all()
+
+
+def test_the_document_names_a_sensor_that_drifts() -> None:
+    model = load_model("fopdt")
+    drifting = parse_model({**model.document, "noise": {"load": {"y": "estimate"}}})
+    found = identify(drifting, make_record(0.0, 1.0, walk=0.01), QUICK)
+    for name, true in TRUTH.items():
+        low, high = found[name].interval95 or (np.nan, np.nan)
+        assert low <= true <= high, name
+    assert found.noise_model == "load"
+
+
+def test_an_unstable_plant_under_control_needs_no_free_run() -> None:
+    random, n, keep = np.random.default_rng(2), 600, np.exp(PERIOD / 8.0)
+    u, y, x, d = np.zeros(n), np.zeros(n), 0.0, 0.0
+    wish = np.repeat(random.choice([-1.0, 1.0], n // 60), 60)
+    for k in range(n):
+        y[k] = x + SENSOR * random.normal()
+        u[k] = 2.0 * (wish[k] - y[k])
+        x = keep * x + (keep - 1) * (u[max(k - 4, 0)] + d)
+        d = 0.98 * d + 0.01 * random.normal()
+    document = {
+        "name": "unstable",
+        "form": "differential",
+        "inputs": {"u": "1"},
+        "states": {"x": "1"},
+        "parameters": {
+            "K": {"lower": 0.05, "upper": 20, "scale": "log"},
+            "T": {"lower": 0.5, "upper": 100, "scale": "log"},
+            "L": {"lower": 0, "upper": 5},
+        },
+        "equations": {"x": "(x + K*u(t - L))/T"},
+        "outputs": {"y": "x"},
+        "initial": {"x": 0},
+    }
+    times = PERIOD * np.arange(n)
+    record = Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
+    filtered = parse_model({**document, "noise": {"load": {"u": "estimate"}}})
+    found = identify(filtered, record, QUICK)
+    for name, true in {"K": 1.0, "T": 8.0, "L": 1.0}.items():
+        low, high = found[name].interval95 or (np.nan, np.nan)
+        assert low <= true <= high, name
+    free = identify(parse_model(document), record)
+    (told,) = [one for one in free.findings if one.explanation == "noise in the plant"]
+    assert told.advice == "Use loss: {noise_model: load}."
+    moves = {move.parameter: move for move in told.moves}
+    for name, move in moves.items():
+        assert move.value == pytest.approx(found[name].value, abs=found[name].stderr)
+    assert any("Use loss=Loss(noise_model='load')" in text for text in free.warnings)
+
+
+def test_a_result_is_saved_exported_simulated_and_drawn(tmp_path: Path) -> None:
+    record = make_record(0.1, 20.0)
+    found = identify("fopdt", record, QUICK, loss=Loss(noise_model="load"))
+    found.save(tmp_path / "found.json")
+    assert Identification.load(tmp_path / "found.json") == found
+    exported = json.loads(export_model(load_model("fopdt"), found, "json"))
+    assert "load[u]" not in str(exported)
+    simulated = simulate("fopdt", record.inputs, found)["y"].values
+    free = simulated - record.outputs[0].values
+    assert found.plant_noise is not None
+    assert np.sqrt(np.mean(free**2)) == pytest.approx(found.plant_noise.rms_free, rel=0.05)
+    (band,) = found.compute_bands()
+    np.testing.assert_allclose(band.simulated, found.simulated[0][0])
+    (ahead,) = found.compute_bands(record.inputs)
+    np.testing.assert_allclose(ahead.simulated, simulated)
