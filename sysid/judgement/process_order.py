@@ -15,12 +15,11 @@ each order has noise of its own, an autoregression that is estimated with it. An
 if its BIC is 6 lower than that of every other: odds of 20 to 1 (Kass and Raftery 1995: strong
 evidence). Orders within 6 of the lowest are open, and the dead time lies in the range of theirs.
 
-An open order that moves the dead time makes it doubtful if it is larger than the model's own, for a
-plant has more time constants than its model rather than fewer. A smaller one does if it is at least
-as likely: its parts belong to the model then (median probability model: Barbieri and Berger, Ann.
-Statist. 32 (2004) 870). So a true model is doubted if a likelihood ratio exceeds 3.84 by chance.
-The new part is at its bound 0 then, which has a probability of ½ P(χ²₁ > 3.84) = 2.5 % (Self and
-Liang, J. Am. Stat. Assoc. 82 (1987) 605), and not each of them moves the dead time.
+An open order makes the dead time doubtful if it is at least as likely as the model's own. Its part
+belongs to the model then (median probability model: Barbieri and Berger, Ann. Statist. 32 (2004)
+870). A less likely one is a note. So a true model is doubted only if a likelihood ratio exceeds
+ln n by chance. The new part is at its bound 0 then, and that has a probability of ½ P(χ²₁ > ln n):
+0.7 % with 400 samples (Self and Liang, J. Am. Stat. Assoc. 82 (1987) 605).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -175,9 +174,9 @@ def find_other_orders(
 ) -> Iterator[Finding]:
     """Find orders that the data prefer, or do not rule out, and that move the dead time.
 
-    Those that count move it by more than its interval, and are larger than the model or as likely.
-    A larger order is advised if it leaves nothing but noise, and if both tell the dead time.
-    `model` is the name of the model that was identified.
+    Those that count move it by more than its interval, and are as likely as the model. A larger
+    order is advised if it leaves nothing but noise, and if both tell the dead time. `model` is the
+    name of the model that was identified.
     """
     if comparison is None or comparison.preferred_model == comparison.model:
         return
@@ -188,7 +187,7 @@ def find_other_orders(
     moved = [fit for fit in others if _is_moved(fit, own)]
     if comparison.preferred_model is None and not moved:
         return
-    is_doubt = any(fit.order > own.order or fit.bic <= own.bic for fit in moved)
+    is_doubt = any(fit.bic <= own.bic for fit in moved)
     listed = ", ".join(_write_delay(comparison, fit) for fit in others)
     instead = f"instead of {estimate.value:.4g}{plain_unit(estimate.unit)}"
     if comparison.preferred_model is None:
@@ -246,7 +245,7 @@ def _write_delay(comparison: OrderComparison, fit: OrderFit) -> str:
 def _read_assumptions(
     problem: Problem, theta: FloatArray, estimates: Sequence[Estimate]
 ) -> _Assumptions | None:
-    if not problem.is_free_run or problem.loss.kind != "squares":
+    if problem.prediction != "simulation" or problem.loss.kind != "squares":
         return None
     delays = find_delay_parameters(problem)
     process = _recognise(problem, theta)

@@ -341,8 +341,6 @@ class ResidualContext:
         with suppress(SysidError):  # a part has no inputs, or the model no such start
             records = [part for one in self.problem.records for part in _divide(one, moment)]
             divided = self.problem.rebuild(records=records, weights=weights)
-            if divided.n_scored != self.times.size:
-                return None
             values = [known.get(name, known.get(name.split("[")[0])) for name in divided.free_names]
             theta = np.array(values, dtype=np.float64)
             found.append(self._fit_again(divided, theta))
@@ -359,10 +357,12 @@ class ResidualContext:
         start: FloatArray,
         left_out: tuple[float, float] | None = None,
     ) -> "Refitted | None":
-        """Fit a problem of the same samples from a point (D',); None if that fails.
+        """Fit a problem from a point (D',); None if that fails, or if it has other samples.
 
         Those from a time up to another one (s) are left out, each by a column of its own.
         """
+        if problem.n_scored != self.times.size:
+            return None
         if not self.simulations.allow(_FULL_FIT * (start.size + 1)):
             return None
         fitted, dummies = problem, np.zeros((self.times.size, 0))

@@ -255,6 +255,9 @@ def test_an_open_order_that_is_less_likely_than_the_model_is_a_note_with_its_lag
         assert (found.severity, found.parameters, found.advice) == ("note", (), "")
         assert [move.value for move in found.moves] == [1.3]
         assert "L is 1.300 ± 0.010 s with topdt instead of 1.4 s." in found.text
+        [found] = list_findings(other, 10.0, 16.1)
+        assert (found.severity, found.parameters, found.advice) == ("note", (), "")
+        assert [move.value for move in found.moves] == [1.57]
 
 
 def test_a_preferred_order_has_its_gain_and_its_lag() -> None:

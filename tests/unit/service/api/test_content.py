@@ -1,6 +1,7 @@
 """Bytes over HTTP: each answer has those of its object, whole or in part."""
 
 import asyncio
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,8 @@ class TwoObjects:
     def get_size(self, sha256: str) -> int:
         return len(WHOLE[sha256])
 
-    def get_stream(self, sha256: str, start: int, length: int) -> list[bytes]:
-        return [WHOLE[sha256][start : start + length]]
+    def get_stream(self, sha256: str, start: int, length: int) -> Iterator[bytes]:
+        yield WHOLE[sha256][start : start + length]
 
 
 def answer(file: str, method: str = "GET", **headers: str) -> Any:
