@@ -18,11 +18,11 @@ from typing import Literal
 CodeKind = Literal["o", "loop"]
 """Object code of a kernel (``o``), or a function compiled by Numba (``loop``)."""
 
-_MAGIC = b"lagid-kernel-1\n"
+_MAGIC = b"lagid-kernel-2\n"
 _DIGEST_SIZE = 32
 _MAX_FILES = 2_000
-"""Each update of lagid adds about fifty files; the least recently used are removed."""
-_CACHE_FILE_NAME = re.compile(r"[0-9a-f]{64}\.(o|loop)")
+"""Of each kind; the least recently used are removed. An update of lagid adds about ninety loops."""
+_STEM = re.compile(r"[0-9a-f]{64}")
 _ADVICE = "set LAGID_CACHE_DIR to a folder that only this user can write to"
 _log = logging.getLogger(__name__)
 _logged_reasons: list[str] = []
@@ -104,7 +104,7 @@ def store_code(key: str, code: bytes, kind: CodeKind = "o") -> None:
             )
             return
         _write_file(folder, f"{key}.{kind}", code)
-        _prune_files(folder)
+        _prune_files(folder, kind)
     except OSError as error:
         reason = error if folder is None else f"{folder}: {error.strerror}"
         warn_not_cached(f"{reason}; {_ADVICE}")
@@ -144,9 +144,16 @@ def _is_private(folder: Path) -> bool:
     return not _belongs_to_another(status) and not status.st_mode & 0o022
 
 
-def _prune_files(folder: Path) -> None:
-    """Remove the oldest files beyond `_MAX_FILES`; other processes may do the same meanwhile."""
-    files = [entry.path for entry in os.scandir(folder) if _CACHE_FILE_NAME.fullmatch(entry.name)]
+def _prune_files(folder: Path, kind: CodeKind) -> None:
+    """Remove the oldest files of a kind beyond `_MAX_FILES`; other processes may do so meanwhile.
+
+    A user's models are many. They must not push out the search, which takes a minute to compile.
+    """
+    files = [
+        entry.path
+        for entry in os.scandir(folder)
+        if entry.name.endswith(f".{kind}") and _STEM.fullmatch(entry.name.removesuffix(f".{kind}"))
+    ]
     if len(files) <= _MAX_FILES:
         return
     dated = []

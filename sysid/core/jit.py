@@ -13,8 +13,11 @@ The search takes about a minute to compile, once after an installation. A line o
 and `read_clock` does not count it.
 """
 
+import itertools
+import os
 import pickle
 import re
+import secrets
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -28,6 +31,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import llvmlite
 import numba
 import numpy as np
+from numba.core.bytecode import FunctionIdentity
 from numba.core.compiler import Compiler, CompilerBase
 
 from sysid.core.code_cache import digest_files, load_code, store_code, warn_not_cached
@@ -59,6 +63,22 @@ _CACHE_ERRORS = (
     pickle.PickleError,
 )
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def _number_functions() -> None:
+    """Number compiled functions from a random start, so that no two processes give one name.
+
+    A compiled function's name holds its number, and Numba counts from 1 in each process. Under one
+    name two functions share what is linked by names, as the Python constants of what they return.
+    With stored functions of other processes such names would meet.
+    """
+    inside: Any = FunctionIdentity
+    inside._unique_ids = itertools.count(secrets.randbits(62))
+
+
+_number_functions()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_number_functions)
 
 
 # Two patterns that begin with plain text: one with `^` would take ten times as long.

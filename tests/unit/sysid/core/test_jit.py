@@ -365,6 +365,18 @@ def test_what_is_used_stays_longer_than_what_is_newer(
     assert sorted(one.name for one in folder.iterdir()) == [f"{0:064x}.loop", f"{2:064x}.loop"]
 
 
+def test_many_kernels_do_not_push_out_the_search(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LAGID_CACHE_DIR", str(folder))
+    monkeypatch.setattr(code_cache, "_MAX_FILES", 2)
+    code_cache.store_code(f"{9:064x}", b"search", "loop")
+    for number in range(4):
+        code_cache.store_code(f"{number:064x}", b"kernel")
+    assert code_cache.load_code(f"{9:064x}", "loop") == b"search"
+    assert len(os.listdir(folder)) == 3
+
+
 def test_files_that_another_process_removes_meanwhile_are_no_fault(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -423,3 +435,43 @@ def test_what_was_compiled_before_is_loaded_without_the_compiler() -> None:
         return ran.stdout.strip()
 
     assert load() == "[]" or load() == "[]"  # the first may have to compile
+
+
+CALLING_MODULE = """
+import numpy as np
+from sysid.core.jit import jit_compile
+
+@jit_compile
+def count_up(n):
+    return np.arange(float(n))
+
+@jit_compile
+def add_up(n):
+    return count_up(n).sum()
+"""
+CALLING_PROGRAM = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from sysid.core import jit
+jit.get_sources_digest = lambda module: "a"
+import module
+print(*(getattr(module, name)(3) for name in sys.argv[2:]))
+"""
+
+
+def test_a_function_compiled_anew_does_not_meet_the_one_in_a_stored_caller(
+    folder: Path, tmp_path: Path
+) -> None:
+    """By Numba's numbers from 1 the new function has the name of the one in its stored caller."""
+    (tmp_path / "module.py").write_text(CALLING_MODULE)
+
+    def call_functions(*names: str) -> str:
+        command = [sys.executable, "-c", CALLING_PROGRAM, str(tmp_path), *names]
+        return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
+
+    call_functions("count_up")
+    (called,) = folder.iterdir()
+    call_functions("add_up")
+    called.unlink()
+    for _ in range(2):  # compiled with the caller's constants present; loaded beside them
+        assert call_functions("add_up", "count_up") == "3.0 [0. 1. 2.]\n"
