@@ -166,9 +166,12 @@ def open_listener(host: str, port: int) -> socket.socket:
 def _run_server(
     settings: "Settings", listener: socket.socket, supervisor: "Supervisor | None"
 ) -> None:
+    import asyncio
+
     import uvicorn
 
     from service.api.app import create_app
+    from service.api.connections import limit_connections, tell_accept_errors_seldom
     from service.core.process.logs import configure_logging
     from service.core.process.loop_watch import LoopWatch, end_if_standing
     from service.dispatch.supervisor import RESTART_EXIT_CODE
@@ -181,6 +184,10 @@ def _run_server(
 
     class Server(uvicorn.Server):
         """Server that stops open event streams and the dispatcher as soon as it must end."""
+
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            tell_accept_errors_seldom(asyncio.get_running_loop())
+            await super().startup(sockets)
 
         async def on_tick(self, counter: int) -> bool:
             loop.turn()
@@ -204,6 +211,7 @@ def _run_server(
         proxy_headers=False,  # the application believes them, of the proxies in its settings
         timeout_graceful_shutdown=SHUTDOWN_SECONDS,
     )
+    limit_connections(config, settings.max_connections)
     Server(config).run(sockets=[listener])
 
 

@@ -14,7 +14,7 @@ from service.control.loop_answer import (
     simulate_closed_loop,
 )
 from service.core.errors import FieldError, InvalidRequest
-from service.core.process.concurrency import simulation_limit
+from service.core.process.concurrency import simulation_places
 from service.datasets.dataset_schemas import DatasetOut
 from service.datasets.datasets import (
     add_recording,
@@ -58,7 +58,6 @@ class _SimulationResult:
     notes: list[str]
 
 
-@simulation_limit.acquire()
 def simulate_run(
     database: Database, store: ObjectStore, run_id: str, body: RunSimulationIn, max_points: int
 ) -> RunSimulationOut:
@@ -73,6 +72,13 @@ def simulate_run(
     InvalidRequest
         With every fault of the inputs and parameters, or where the simulation diverges.
     """
+    with simulation_places.hold(database.owner.project_id):
+        return _simulate_run(database, store, run_id, body, max_points)
+
+
+def _simulate_run(
+    database: Database, store: ObjectStore, run_id: str, body: RunSimulationIn, max_points: int
+) -> RunSimulationOut:
     with database.read_session() as session:
         request = _read_request(session, store, run_id, body)
     loop = _simulate_loop(request, body.control) if body.control else None

@@ -28,6 +28,7 @@ from service.datasets.dataset_schemas import (
 )
 from service.datasets.stored_recordings import load_recording
 from service.formats.file_kinds import SUFFIXES, detect_kind
+from service.formats.limits import DEFAULT_LIMITS, UploadLimits
 from service.formats.mcap.mcap_files import write_recording
 from service.formats.sandbox import read_untrusted
 from service.repositories.dataset_rows import DatasetRepository, NewDataset, StoredDataset
@@ -114,6 +115,7 @@ def add_upload(
     name: str | None = None,
     segments: Sequence[str] = (),
     sample_time: float | None = None,
+    limits: UploadLimits = DEFAULT_LIMITS,
 ) -> StoredDataset:
     """Store an uploaded file, or return the existing dataset of the same bytes.
 
@@ -140,7 +142,7 @@ def add_upload(
     if existing is not None:
         return StoredDataset(existing, is_new=False)
     # Reading takes time. An open transaction would block all others on SQLite.
-    read = read_untrusted(path, suffix=suffix, segments=segments, sample_time=sample_time)
+    read = read_untrusted(path, limits, suffix=suffix, segments=segments, sample_time=sample_time)
     details = {"source": read_as, "warnings": list(read.notes)}
     return add_recording(
         database,

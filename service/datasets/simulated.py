@@ -8,7 +8,7 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
-from service.core.process.concurrency import simulation_limit
+from service.core.process.concurrency import simulation_places
 from service.datasets.dataset_schemas import InputIn, SimulateIn
 from service.datasets.datasets import (
     add_recording,
@@ -70,7 +70,6 @@ class SimulatedDataset:
         )
 
 
-@simulation_limit.acquire()
 def simulate_dataset(database: Database, store: ObjectStore, body: SimulateIn) -> StoredDataset:
     """Simulate a model or a plant as a dataset; the same body returns the same dataset.
 
@@ -79,10 +78,13 @@ def simulate_dataset(database: Database, store: ObjectStore, body: SimulateIn) -
     InvalidRequest
         With every fault: unknown model, parameter or signal, a missing value, a bad expression.
     """
-    if body.plant is not None:
-        return simulate_plant(database, store, body)
-    dataset = simulate_or_find(database, store, body)
-    return dataset if isinstance(dataset, StoredDataset) else dataset.store_dataset(database, store)
+    with simulation_places.hold(database.owner.project_id):
+        if body.plant is not None:
+            return simulate_plant(database, store, body)
+        dataset = simulate_or_find(database, store, body)
+        if isinstance(dataset, StoredDataset):
+            return dataset
+        return dataset.store_dataset(database, store)
 
 
 def simulate_or_find(

@@ -13,7 +13,7 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
-from service.core.process.concurrency import simulation_limit
+from service.core.process.concurrency import simulation_places
 from service.datasets.datasets import to_series
 from service.datasets.signal_channels import SignalChannels, map_channels
 from service.datasets.stored_recordings import read_records
@@ -85,14 +85,14 @@ def validate_run(
     )
 
 
-@simulation_limit.acquire()
 def simulate_free_run(
     database: Database, store: ObjectStore, run_id: str, body: FreeRunIn
 ) -> FreeRun:
     """Simulate as `validate_run` does, but return arrays. Raises the same errors."""
-    with database.read_session() as session:
-        problem, row = _read_problem(session, store, run_id, body)
-    return _evaluate_free_run(problem, run_id, row)
+    with simulation_places.hold(database.owner.project_id):
+        with database.read_session() as session:
+            problem, row = _read_problem(session, store, run_id, body)
+        return _evaluate_free_run(problem, run_id, row)
 
 
 def _read_problem(

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 import uvicorn
 from fastapi import FastAPI
 
+from service.api.connections import limit_connections
 from sysid.core.awake_clock import read_awake_seconds
 from tests.support.limits import LIMIT_SECONDS
 
@@ -19,7 +20,9 @@ REQUESTS_LIMIT_SECONDS = 10
 
 
 @contextmanager
-def serve_in_thread(app: FastAPI, bound: socket.socket | None = None) -> Iterator[str]:
+def serve_in_thread(
+    app: FastAPI, bound: socket.socket | None = None, *, most_connections: int = 1000
+) -> Iterator[str]:
     """Serve the application for the length of the block, at the address that is given.
 
     With a bound socket at its port; the server closes that socket. The server has ended when
@@ -33,6 +36,7 @@ def serve_in_thread(app: FastAPI, bound: socket.socket | None = None) -> Iterato
         ws="none",
         timeout_graceful_shutdown=REQUESTS_LIMIT_SECONDS,
     )
+    limit_connections(config, most_connections)
     server = uvicorn.Server(config)
     sockets = None if bound is None else [bound]
     thread = threading.Thread(target=server.run, args=(sockets,), name="server")
