@@ -39,6 +39,7 @@ from service.repositories.lineage_rows import (
     find_tombstones,
     list_dataset_names,
 )
+from service.repositories.project_rows import check_room
 from service.repositories.search_conditions import NO_FILTER, ListFilter
 from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database, release_connection
@@ -217,7 +218,7 @@ def add_recording(
     # The source of an upload is its file; that of others follows from parents and request.
     file = (details.get("source") or {}).get("sha256", "") if kind == "upload" else ""
     metadata = {"source": file, "source_key": key, "parents": " ".join(parents), "name": name}
-    content = _store_file(store, recording, metadata)
+    content = _store_file(database, store, recording, metadata, is_new=existing is None)
     new = describe_recording(
         recording, name=name, kind=kind, key=key, details=details, content=content
     )
@@ -349,11 +350,19 @@ def _hash_derivation(parent: Dataset, body: DeriveIn) -> str:
 
 
 def _store_file(
-    store: ObjectStore, recording: Recording, metadata: Mapping[str, str]
+    database: Database,
+    store: ObjectStore,
+    recording: Recording,
+    metadata: Mapping[str, str],
+    *,
+    is_new: bool,
 ) -> StoredObject:
     with tempfile.TemporaryDirectory(prefix=temporary_files.make_temporary_prefix()) as folder:
         path = Path(folder) / "recording.mcap"
         write_recording(recording, path, metadata=metadata)
+        if is_new:  # what is refused leaves no object behind
+            with database.read_session() as session:
+                check_room(session, path.stat().st_size)
         return store.put_file(path)
 
 

@@ -1,6 +1,7 @@
 """Use case: a dataset simulated from a model or a plant, with inputs and noise."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
-from service.core.process.concurrency import simulation_places
+from service.core.process.concurrency import FairPlaces, simulation_places
 from service.datasets.dataset_schemas import InputIn, SimulateIn
 from service.datasets.datasets import (
     add_recording,
@@ -28,6 +29,11 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
 from sysid.models.model import DerivedInitial, FixedInitial, Model
 from sysid.models.model_delays import check_delays
+
+
+LARGE_SAMPLES = 1_000_000
+_large_places = FairPlaces(1, 1, what="simulations of more than a million samples")
+"""One of these at a time: a sample takes some 370 bytes meanwhile (10⁷ of two channels)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +84,11 @@ def simulate_dataset(database: Database, store: ObjectStore, body: SimulateIn) -
     InvalidRequest
         With every fault: unknown model, parameter or signal, a missing value, a bad expression.
     """
-    with simulation_places.hold(database.owner.project_id):
+    project = database.owner.project_id
+    with ExitStack() as places:
+        if (body.samples or 0) > LARGE_SAMPLES:
+            places.enter_context(_large_places.hold(project))
+        places.enter_context(simulation_places.hold(project))
         if body.plant is not None:
             return simulate_plant(database, store, body)
         dataset = simulate_or_find(database, store, body)
