@@ -65,7 +65,7 @@ class ConnectionLimits:
 
     def __init__(self, most: int) -> None:
         self.most = most
-        self.waiting: dict[LimitedConnection, None] = {}
+        self.waiting: dict[HttpConnection, None] = {}
         self.n_lingering = 0
         self.refusals = RareLog()
 
@@ -91,7 +91,7 @@ def _build_answer(status: int, kind: str, title: str, detail: str, headers: Any 
     return "\r\n".join([*lines, "", ""]).encode() + body
 
 
-class LimitedConnection(H11Protocol):
+class HttpConnection(H11Protocol):
     """A connection that must send each head in time, and makes room while it has no request."""
 
     def __init__(self, *arguments: Any, limits: ConnectionLimits, **options: Any) -> None:
@@ -184,7 +184,7 @@ class LimitedConnection(H11Protocol):
 def limit_connections(config: Config, wanted: int) -> None:
     """Let the server of this configuration have at most so many connections."""
     limits = ConnectionLimits(min(wanted, max(1, _raise_file_limit() - RESERVED_FILES)))
-    config.http = partial(LimitedConnection, limits=limits)  # type: ignore[assignment]
+    config.http = partial(HttpConnection, limits=limits)  # type: ignore[assignment]
 
 
 def _raise_file_limit() -> int:

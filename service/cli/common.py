@@ -225,8 +225,10 @@ def print_error(message: str) -> None:
 
 
 def check_succeeded(job: Mapping[str, Any]) -> None:
-    """End the command with the reason if a finished job did not succeed."""
-    if job["state"] != "succeeded":
+    """End the command with the reason if a finished job has no result; tell of failed runs."""
+    if job["state"] == "incomplete":
+        print_error(f"{job['id']}: {job['error']}")
+    elif job["state"] != "succeeded":
         reason = f": {job['error']}" if job["error"] else ""
         fail(f"{job['id']} {job['state']}{reason}")
 

@@ -911,8 +911,8 @@ class JobDocument(TypedDict):
     """identifier, `job_…`"""
     name: str
     """name of the job"""
-    state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
-    """state of the job"""
+    state: Literal["queued", "running", "succeeded", "failed", "cancelled", "incomplete"]
+    """state of the job; `incomplete`: it has ended, and some of its runs have failed"""
     cancel_requested: NotRequired[bool]
     """whether it was asked to stop, and has not yet"""
     created_at: str
@@ -1012,7 +1012,7 @@ class LimitsDocument(TypedDict):
     max_open_runs: int
     """most runs of these jobs that have not ended"""
     max_stored_bytes: int | None
-    """most bytes of recordings"""
+    """most bytes of recordings and results"""
     max_daily_evaluations: int | None
     """most simulations of jobs that ran in the last 24 hours"""
 
@@ -2016,7 +2016,7 @@ class UseDocument(TypedDict):
     open_runs: int
     """runs of these jobs that have not ended"""
     stored_bytes: int
-    """bytes of recordings"""
+    """bytes of recordings, and of results at 8.4 kB a run"""
     daily_evaluations: int
     """simulations of jobs that ran in the last 24 hours"""
 

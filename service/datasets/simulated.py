@@ -30,7 +30,6 @@ from sysid.data.records import Channel, Recording
 from sysid.models.model import DerivedInitial, FixedInitial, Model
 from sysid.models.model_delays import check_delays
 
-
 LARGE_SAMPLES = 1_000_000
 _large_places = FairPlaces(1, 1, what="simulations of more than a million samples")
 """One of these at a time: a sample takes some 370 bytes meanwhile (10⁷ of two channels)."""

@@ -369,7 +369,9 @@ class JobOut(Answer):
 
     id: str = Field(description="identifier, `job_…`")
     name: str = Field(description="name of the job")
-    state: StateName = Field(description="state of the job")
+    state: StateName = Field(
+        description="state of the job; `incomplete`: it has ended, and some of its runs have failed"
+    )
     cancel_requested: bool = Field(
         default=False, description="whether it was asked to stop, and has not yet"
     )
