@@ -199,7 +199,7 @@ def aggregate_runs(
     located = groups.locate_runs(table.numbers)
     inside = located >= 0
     succeeded = inside & table.is_in_state(JobState.SUCCEEDED)
-    counts = {
+    counts: dict[JobState, Any] = {
         state: np.bincount(located[inside & table.is_in_state(state)], minlength=n_groups)
         for state in RUN_STATES
     }
