@@ -1014,7 +1014,7 @@ class LimitsDocument(TypedDict):
     max_stored_bytes: int | None
     """most bytes of recordings and results"""
     max_daily_evaluations: int | None
-    """most simulations of jobs that ran in the last 24 hours"""
+    """most simulations of the last 24 hours, of jobs that ran and of requests"""
 
 class LineageEdgeDocument(TypedDict):
     """`child` was made from `parent`."""
@@ -2018,7 +2018,7 @@ class UseDocument(TypedDict):
     stored_bytes: int
     """bytes of recordings, and of results at 8.4 kB a run"""
     daily_evaluations: int
-    """simulations of jobs that ran in the last 24 hours"""
+    """simulations of the last 24 hours, of jobs that ran and of requests"""
 
 class ValidationInDocument(TypedDict):
     """Validation data: other datasets, or the last fraction of each record."""

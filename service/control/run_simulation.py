@@ -26,6 +26,7 @@ from service.datasets.datasets import (
 from service.datasets.simulated import check_finite_outputs, check_given_delays
 from service.datasets.waveforms import InputSignals, interpolate_channel
 from service.jobs.stored_run import StoredRun, load_estimated_run
+from service.queue.daily_limit import check_budget, count_evaluations
 from service.repositories.dataset_rows import DatasetRepository
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
@@ -72,8 +73,11 @@ def simulate_run(
     InvalidRequest
         With every fault of the inputs and parameters, or where the simulation diverges.
     """
+    check_budget(database)
     with simulation_places.hold(database.owner.project_id):
-        return _simulate_run(database, store, run_id, body, max_points)
+        answer = _simulate_run(database, store, run_id, body, max_points)
+    count_evaluations(database, 1)
+    return answer
 
 
 def _simulate_run(

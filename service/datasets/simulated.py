@@ -20,6 +20,7 @@ from service.datasets.datasets import (
 from service.datasets.plants import simulate_plant
 from service.datasets.waveforms import InputSignals
 from service.models import models
+from service.queue.daily_limit import check_budget, count_evaluations
 from service.repositories.dataset_rows import StoredDataset, build_dataset_row
 from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database
@@ -83,16 +84,20 @@ def simulate_dataset(database: Database, store: ObjectStore, body: SimulateIn) -
     InvalidRequest
         With every fault: unknown model, parameter or signal, a missing value, a bad expression.
     """
+    check_budget(database)
     project = database.owner.project_id
     with ExitStack() as places:
         if (body.samples or 0) > LARGE_SAMPLES:
             places.enter_context(_large_places.hold(project))
         places.enter_context(simulation_places.hold(project))
         if body.plant is not None:
-            return simulate_plant(database, store, body)
+            made = simulate_plant(database, store, body)
+            count_evaluations(database, 1)
+            return made
         dataset = simulate_or_find(database, store, body)
         if isinstance(dataset, StoredDataset):
             return dataset
+        count_evaluations(database, 1)
         return dataset.store_dataset(database, store)
 
 

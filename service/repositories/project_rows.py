@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import timedelta
 
-from sqlalchemy import ColumnElement, case, func, select
+from sqlalchemy import ColumnElement, case, delete, func, select, update
 from sqlalchemy.orm import Session
 
 from service.core.errors import BudgetExceeded
@@ -13,9 +13,9 @@ from service.repositories.audit_rows import record_action
 from service.storage.columns import utc_now
 from service.storage.garbage import MINIMUM_AGE
 from service.storage.sessions import find_project
-from service.storage.statements import new_id
+from service.storage.statements import insert_missing, new_id
 from service.storage.storage_errors import RowConflict, RowNotFound
-from service.storage.tables import Dataset, Job, Project
+from service.storage.tables import Dataset, Job, Project, RequestedWork
 
 DAY = timedelta(days=1)
 FULL_RETRY_SECONDS = 3600.0
@@ -38,7 +38,7 @@ class ProjectLimits:
         Bytes of the stored recordings and results. With those that are deleted but still there,
         at most twice as many.
     max_daily_evaluations : int or None
-        Evaluations of the jobs that ran in the last 24 hours.
+        Evaluations of the last 24 hours: of jobs that ran, and of requests.
     """
 
     max_open_jobs: int | None = None
@@ -197,7 +197,7 @@ def check_daily_evaluations(session: Session, project_id: str, limit: int | None
     if made < limit:
         return
     raise BudgetExceeded(
-        f"{_describe_overrun(made, limit)} Submit this job later, or ask the operator for more "
+        f"{_describe_overrun(made, limit)} Try again later, or ask the operator for more "
         "(`lagid project limit`)",
         _find_seconds_until_free(session, project_id),
     )
@@ -232,7 +232,7 @@ def list_overruns(session: Session) -> list[Overrun]:
 
 
 def _describe_overrun(made: int, limit: int) -> str:
-    return f"the jobs of the last 24 hours made {made} evaluations; {limit} are allowed."
+    return f"the last 24 hours made {made} evaluations; {limit} are allowed."
 
 
 def count_stored_bytes(session: Session, project_id: str, *, with_deleted: bool = False) -> int:
@@ -260,7 +260,7 @@ def count_stored_bytes(session: Session, project_id: str, *, with_deleted: bool 
 
 
 def _count_daily_evaluations(session: Session, project_id: str) -> int:
-    """Count the evaluations of the jobs that ended in the last 24 hours, and of the open ones.
+    """Count the evaluations of requests, of jobs that ended in the last 24 hours, and of open ones.
 
     Runs that were taken over from other jobs cost nothing: their part of a job does not count.
     """
@@ -270,14 +270,36 @@ def _count_daily_evaluations(session: Session, project_id: str) -> int:
     of_project = Job.project_id == project_id
     ended = select(own).where(of_project, Job.finished_at >= utc_now() - DAY)
     running = select(own).where(of_project, Job.state.in_(OPEN_STATES))
-    return int(session.scalar(ended) or 0) + int(session.scalar(running) or 0)
+    requested = select(func.sum(RequestedWork.evaluations)).where(
+        RequestedWork.project_id == project_id, RequestedWork.hour > utc_now() - DAY
+    )
+    return sum(int(session.scalar(query) or 0) for query in (ended, running, requested))
+
+
+def add_requested_work(session: Session, evaluations: int) -> None:
+    """Add evaluations that a request of the session's project has made to those of the hour."""
+    now = utc_now()
+    of_project = RequestedWork.project_id == find_project(session)
+    key = {
+        "project_id": find_project(session),
+        "hour": now.replace(minute=0, second=0, microsecond=0),
+    }
+    insert_missing(session, RequestedWork, [{**key, "evaluations": 0}])
+    session.execute(
+        update(RequestedWork)
+        .where(of_project, RequestedWork.hour == key["hour"])
+        .values(evaluations=RequestedWork.evaluations + evaluations)
+    )
+    session.execute(delete(RequestedWork).where(of_project, RequestedWork.hour <= now - DAY))
 
 
 def _find_seconds_until_free(session: Session, project_id: str) -> float:
     now = utc_now()
-    first = session.scalar(
-        select(func.min(Job.finished_at)).where(
-            Job.project_id == project_id, Job.finished_at >= now - DAY
-        )
+    jobs = select(func.min(Job.finished_at)).where(
+        Job.project_id == project_id, Job.finished_at >= now - DAY
     )
+    requests = select(func.min(RequestedWork.hour)).where(
+        RequestedWork.project_id == project_id, RequestedWork.hour > now - DAY
+    )
+    first = min(filter(None, (session.scalar(jobs), session.scalar(requests))), default=None)
     return FULL_RETRY_SECONDS if first is None else (first + DAY - now).total_seconds()

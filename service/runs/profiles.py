@@ -4,7 +4,8 @@ It runs in a thread of the web process, in parallel with other requests. Work th
 long is refused, or stopped when it does. A project has one profile at a time.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from time import monotonic
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ import numpy as np
 from service.core.errors import Conflict, InvalidRequest, ServiceBusy
 from service.core.process.concurrency import FairPlaces
 from service.jobs.stored_run import StoredRun, load_estimated_run
+from service.queue.daily_limit import check_budget, count_evaluations
 from service.runs.run_schemas import ProfileIn, ProfileOut, RunProfilesOut
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
@@ -58,9 +60,11 @@ def compute_profiles(
             f"{MAX_WORK:.3g}. "
             "Ask for fewer, or use sysid.uncertainty.profile_likelihood.compute_profile",
         )
+    check_budget(database)
+    count = partial(count_evaluations, database)
     try:
         with _places.hold(database.owner.project_id):
-            profiles = list(_profile_parameters(problem, theta, names, body.points))
+            profiles = list(_profile_parameters(problem, theta, names, body.points, count))
     except ServiceBusy:
         raise Conflict("another profile is being computed. Ask again when it is done") from None
     return RunProfilesOut(id=run_id, threshold=CHI_SQUARED_95, profiles=profiles)
@@ -78,7 +82,11 @@ def _choose_parameters(problem: "Problem", body: ProfileIn) -> list[str]:
 
 
 def _profile_parameters(
-    problem: "Problem", theta: FloatArray, names: list[str], points: int
+    problem: "Problem",
+    theta: FloatArray,
+    names: list[str],
+    points: int,
+    count: Callable[[int], None],
 ) -> Iterator[ProfileOut]:
     # This imports the compiler, which most requests never need.
     from sysid.uncertainty.profile_likelihood import compute_profile
@@ -86,6 +94,7 @@ def _profile_parameters(
     end = monotonic() + LIMIT_SECONDS
     for name in names:
         profile = compute_profile(problem, theta, name, points, lambda: monotonic() > end)
+        count(profile.evaluations)
         if not profile.is_complete:
             raise InvalidRequest.from_fault(
                 "/parameters",

@@ -7,7 +7,7 @@ from threading import Barrier
 
 import numpy as np
 import pytest
-from sqlalchemy import update
+from sqlalchemy import func, select, update
 
 from service.core.errors import BudgetExceeded, QuotaExceeded
 from service.core.settings import Settings
@@ -15,12 +15,14 @@ from service.core.states import JobState
 from service.datasets.datasets import add_recording
 from service.dispatch.held_leases import HeldLeases
 from service.jobs.submit import check_limits, resume_job
-from service.queue.daily_limit import stop_overruns
+from service.queue.daily_limit import check_budget, count_evaluations, stop_overruns
 from service.queue.leases import JobProgress, Lease, LeaseQueue
+from service.repositories import project_rows
 from service.repositories.audit_rows import list_actions
 from service.repositories.dataset_rows import DatasetRepository
 from service.repositories.job_rows import JobRepository
 from service.repositories.project_rows import (
+    DAY,
     REMOVAL_TIME,
     RESULT_BYTES,
     ProjectRepository,
@@ -30,7 +32,7 @@ from service.storage.columns import utc_now
 from service.storage.objects import open_store
 from service.storage.sessions import Database, SessionOwner, find_project
 from service.storage.storage_errors import RowConflict, RowNotFound
-from service.storage.tables import Dataset, Job
+from service.storage.tables import Dataset, Job, RequestedWork
 from sysid.data.records import Channel, Recording
 from tests.support.storage.databases import record_statements
 from tests.support.storage.job_rows import claim, job_of, new_dataset, new_job, state_of, submit
@@ -257,6 +259,31 @@ def test_what_a_project_uses_is_measured(limited_database: Database) -> None:
         others = repository.measure_use("proj_default")
     assert (used.stored_bytes, used.daily_evaluations) == (100_000 + RESULT_BYTES, 80)
     assert (others.stored_bytes, others.daily_evaluations) == (0, 0)
+
+
+def test_what_a_web_process_computes_counts_for_a_day(
+    limited_database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def use() -> int:
+        with limited_database.read_session() as session:
+            return ProjectRepository(session).measure_use(find_project(session)).daily_evaluations
+
+    for evaluations in (1, 60, 39):
+        check_budget(limited_database)
+        count_evaluations(limited_database, evaluations)
+    assert use() == 100
+    with pytest.raises(BudgetExceeded, match="made 100 evaluations; 100 are allowed") as error:
+        check_budget(limited_database)
+    assert DAY.total_seconds() - 3600 <= int(error.value.headers["Retry-After"]) <= 86400
+    with pytest.raises(BudgetExceeded):
+        add_job(limited_database)
+    later = utc_now() + DAY
+    monkeypatch.setattr(project_rows, "utc_now", lambda: later)
+    assert use() == 0
+    count_evaluations(limited_database, 5)
+    with limited_database.read_session() as session:
+        assert session.scalar(select(func.count()).select_from(RequestedWork)) == 1
+    assert use() == 5
 
 
 def test_without_a_limit_nothing_is_counted(database: Database) -> None:
