@@ -183,7 +183,7 @@ def _kill_worker() -> int:
             with suppress(psutil.Error):
                 if child.name().startswith(WORKER_NAME[:15]):  # as long as Linux keeps names
                     child.send_signal(signal.SIGKILL)
-                    return child.pid
+                    return int(child.pid)
         time.sleep(0.05)
     raise DrillFailed(f"no worker computed within {WORKER_SECONDS:g} s")
 
