@@ -37,6 +37,7 @@ from sysid.uncertainty.estimates import Estimate, EstimateStatus, IntervalEnd
 
 _TAIL = 0.025  # of the distribution, beyond each end of an interval
 _POOR_SHARE = 1 / 3  # of a range: an interval around 0 that covers more says little
+_ROUNDING = 1e-9  # of a range: an interval that is as wide
 _ENDS: tuple[IntervalEnd, ...] = get_args(IntervalEnd)
 _HALVINGS = 60  # of the range of a quantile: to the resolution of a number
 
@@ -346,7 +347,8 @@ def mark_poor_intervals(
 ) -> tuple[Estimate, ...]:
     """Mark the identified estimates whose 95 % interval says little more than their bounds.
 
-    It is wider than the range, or it contains 0 and more than a third of the range.
+    It is wider than the range, or it contains 0 and more than a third of the range. What lies
+    beyond a physical limit does not count.
     """
     by_name = {parameter.name: parameter for parameter in parameters}
     marked = []
@@ -379,8 +381,12 @@ def _keep_in_bounds(estimate: Estimate) -> Estimate:
 def _explain_poor_interval(parameter: Parameter, interval: Interval) -> str:
     """Explain how an interval says too little; empty if it says enough."""
     lower, upper = parameter.lower, parameter.upper
+    interval = (
+        max(interval[0], lower) if parameter.is_physical("lower") else interval[0],
+        min(interval[1], upper) if parameter.is_physical("upper") else interval[1],
+    )
     poorly = "these data determine it poorly: its 95 % interval"
-    if interval[1] - interval[0] >= upper - lower:
+    if interval[1] - interval[0] >= (1.0 - _ROUNDING) * (upper - lower):
         return f"{poorly} is wider than its range"
     low, high = max(interval[0], lower), min(interval[1], upper)
     if parameter.scale == "log":

@@ -18,7 +18,9 @@ place of a jump follows the larger of two exponential variables then, not χ²: 
 -2 ln(1 - √0.95) = 7.35 (Hansen, Econometrica 68 (2000) 575).
 
 Where Q stays below the limit up to the bound, the end is *open*: the data say nothing there. It is
-open as well if another parameter meets its bound before: without that, the valley would go on.
+open as well if another parameter meets its bound before: without that, the valley would go on. A
+bound that is a physical limit closes it. No value lies beyond, and the set that the likelihood
+ratio does not rule out ends there (Self and Liang, J. Am. Stat. Assoc. 82 (1987) 605).
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -32,7 +34,7 @@ from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 from sysid.identifiability.exchange import find_ordered_partners
 from sysid.search.least_squares import ScoredSamples, fill_jacobian
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import from_unit, is_at_bounds, to_unit
+from sysid.simulation.scaling import find_physical_bounds, from_unit, is_at_bounds, to_unit
 from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.estimates import Estimate, IntervalEnd
 from sysid.uncertainty.intervals import ProfileEnds
@@ -110,8 +112,8 @@ class _StoppedError(Exception):
 class _End(NamedTuple):
     """An end of an interval in unit coordinates.
 
-    It is open if only a bound stops it. `limit` is the parameter with that bound. If the steps did
-    not suffice, it `is_rough`: a point inside.
+    It is open if only a bound of the search stops it. `limit` is the parameter with that bound. If
+    the steps did not suffice, it `is_rough`: a point inside.
     """
 
     position: float
@@ -165,6 +167,7 @@ class _EndSearch:
         self._start = self._linearise(self._point)
         # The output does not change near a lag on a plateau, which stays where it is.
         self._moves: BoolArray = np.any(self._start.columns != 0.0, axis=0)
+        self._is_physical = find_physical_bounds(problem.free_parameters)
         self._local_ends, self._resolution = np.zeros((theta.size, 2)), np.zeros(theta.size)
 
     def select_doubtful(self, estimates: Sequence[Estimate], correlation: FloatArray) -> list[int]:
@@ -229,7 +232,8 @@ class _EndSearch:
             if valley.ratio < limit:
                 inside = float(point[d])
                 if inside == max(side, 0.0):
-                    return _End(inside, self._problem.free_names[d])
+                    is_closed = self._is_physical[number, d]
+                    return _End(inside, "" if is_closed else self._problem.free_names[d])
             else:
                 outside = float(point[d])
             if abs(outside - inside) <= self._resolution[d]:
@@ -251,9 +255,10 @@ class _EndSearch:
     def _name_limit(self, linear: LinearRatio, point: FloatArray, d: int, limit: float) -> str:
         """Name another parameter whose bound ends the valley at a point: without it Q is smaller.
 
-        It has met that bound on the way from the estimate. Empty: no bound matters.
+        It has met that bound on the way from the estimate. Empty: no bound of the search matters.
         """
-        is_held = np.logical_or(*is_at_bounds(point)) & ~np.logical_or(*is_at_bounds(self._point))
+        is_held = np.any(np.array(is_at_bounds(point)) & ~self._is_physical, axis=0)
+        is_held &= ~np.logical_or(*is_at_bounds(self._point))
         is_held &= self._moves & (np.arange(point.size) != d)
         if not is_held.any():
             return ""
