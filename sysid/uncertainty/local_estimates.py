@@ -11,7 +11,7 @@ from sysid.language.evaluation import evaluate_expression
 from sysid.language.tree import Expression
 from sysid.models.parameters import Parameter
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.estimates import Estimate, EstimateStatus
+from sysid.uncertainty.estimates import AT_LIMIT, Estimate, EstimateStatus
 from sysid.uncertainty.intervals import LocalInterval, compose_interval
 
 _TIE_STEP = 1e-6  # of the range: slopes of ties
@@ -142,7 +142,7 @@ def _explain_status(
     return {
         "unidentifiable": "these data determine it poorly: its standard error is as large as "
         "its range",
-        "identified": "it lies at its bound, a limit of the quantity" if is_limited else "",
+        "identified": AT_LIMIT if is_limited else "",
         "at bound": "it lies at its bound; the standard error is that of the linear model",
     }.get(status, "")
 

@@ -113,12 +113,14 @@ class _End(NamedTuple):
     """An end of an interval in unit coordinates.
 
     It is open if only a bound of the search stops it. `limit` is the parameter with that bound. If
-    the steps did not suffice, it `is_rough`: a point inside.
+    the steps did not suffice, it `is_rough`: a point inside. `meets_limit`: a parameter is at a
+    physical limit there.
     """
 
     position: float
     limit: str = ""
     is_rough: bool = False
+    meets_limit: bool = False
 
 
 class _Valley(NamedTuple):
@@ -158,6 +160,7 @@ class _EndSearch:
         model: LikelihoodModel,
         most: int,
     ) -> None:
+        self._groups = () if analysis.uncertainty is None else analysis.uncertainty.groups
         self._problem, self._exchanges, self._most = problem, analysis.exchanges, most
         self._likelihood, self._quantiles = Likelihood(problem, model), model.quantiles
         self.evaluations = 0
@@ -172,10 +175,14 @@ class _EndSearch:
 
     def select_doubtful(self, estimates: Sequence[Estimate], correlation: FloatArray) -> list[int]:
         """Select the parameters whose local interval may not hold."""
+        evaluator = self._problem.evaluator
+        widths = evaluator.upper - evaluator.lower
+        is_mirrored = self._find_mirrored(estimates)
         errors = np.array([one.stderr or 0.0 for one in estimates])
+        errors = np.where(is_mirrored, widths / self._quantiles, errors)
         at_bound = np.array([one.status == "at bound" for one in estimates])
         chosen = np.flatnonzero((errors > 0.0) & ~at_bound)
-        evaluator, reach = self._problem.evaluator, self._quantiles * errors
+        reach = self._quantiles * errors
         points, shares = [], []
         for d in chosen.tolist():
             valley = self._find_valley(self._start, self._point, d)
@@ -194,8 +201,22 @@ class _EndSearch:
             is_curved = np.any(np.abs(roots / np.array(shares) - 1.0) > _NOTABLE_CURVATURE, axis=1)
         related = np.abs(correlation[np.ix_(chosen, chosen)]) - np.eye(chosen.size)
         is_related = np.any(related > _HIGH_CORRELATION, axis=1)
-        is_doubtful = is_curved | is_related | ~self._moves[chosen]
+        is_doubtful = is_curved | is_related | ~self._moves[chosen] | is_mirrored[chosen]
         return [int(d) for d in chosen[is_doubtful]]
+
+    def _find_mirrored(self, estimates: Sequence[Estimate]) -> BoolArray:
+        """Find parameters (D,) without an error, in a combination that has a physical limit."""
+        bounded = np.any(self._is_physical, axis=0)
+        limited = {one.name for one, has_limit in zip(estimates, bounded, strict=True) if has_limit}
+        members = {
+            name for group in self._groups if limited & set(group.members) for name in group.members
+        }
+        return np.array(
+            [
+                one.stderr is None and one.status == "group" and one.name in members
+                for one in estimates
+            ]
+        )
 
     def find_ends(self, d: int) -> ProfileEnds | None:
         """Find both ends of a parameter; None if the search stopped before."""
@@ -211,7 +232,9 @@ class _EndSearch:
             if end.limit:
                 limits[name] = end.limit
         is_closed = not (limits or any(end.is_rough for end in ends))
-        return ProfileEnds((lower, upper), limits, is_closed, is_set=not self._moves[d])
+        meets_limit = any(end.meets_limit for end in ends)
+        is_set = not self._moves[d]
+        return ProfileEnds((lower, upper), limits, is_closed, is_set, meets_limit)
 
     def _find_end(self, d: int, number: int) -> _End:
         """Find the lower end (0) or the upper one (1).
@@ -232,8 +255,9 @@ class _EndSearch:
             if valley.ratio < limit:
                 inside = float(point[d])
                 if inside == max(side, 0.0):
-                    is_closed = self._is_physical[number, d]
-                    return _End(inside, "" if is_closed else self._problem.free_names[d])
+                    is_closed = bool(self._is_physical[number, d])
+                    name = "" if is_closed else self._problem.free_names[d]
+                    return _End(inside, name, meets_limit=is_closed)
             else:
                 outside = float(point[d])
             if abs(outside - inside) <= self._resolution[d]:
@@ -241,7 +265,9 @@ class _EndSearch:
             step = valley.find_step(side, limit, self._find_longest_step(point, d))
             target = float(np.clip(point[d] + step, 0.0, 1.0))
             if abs(root - 1.0) <= _TOLERANCE:
-                return _End(target, self._name_limit(linear, point, d, limit))
+                held = np.array(is_at_bounds(point)) & self._is_physical
+                name = self._name_limit(linear, point, d, limit)
+                return _End(target, name, meets_limit=bool(held.any()))
             if not side * inside < side * target < side * outside:
                 target = 0.5 * (inside + outside) if np.isfinite(outside) else target
             point = self._follow(point, valley, d, target - float(point[d]), limit)
