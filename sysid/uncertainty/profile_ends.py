@@ -192,7 +192,8 @@ class _EndSearch:
             )
             shares.append(np.abs(ends[:, d] - self._theta[d]) / reach[d])
             self._local_ends[d] = to_unit(evaluator, ends)[:, d]
-            self._resolution[d] = _RESOLUTION * np.ptp(self._local_ends[d])
+            if not is_mirrored[d]:  # the range that its steps begin with resolves nothing
+                self._resolution[d] = _RESOLUTION * np.ptp(self._local_ends[d])
             steps = self._local_ends[d] - self._point[d]
             points.append(np.clip(self._point + steps[:, None] * valley.turning, 0.0, 1.0))
         ratios = self._compute_ratios(np.concatenate(points)).reshape(-1, 2)
@@ -257,17 +258,16 @@ class _EndSearch:
                 if inside == max(side, 0.0):
                     is_closed = bool(self._is_physical[number, d])
                     name = "" if is_closed else self._problem.free_names[d]
-                    return _End(inside, name, meets_limit=is_closed)
+                    return _End(inside, name, meets_limit=self._meets_limit(point))
             else:
                 outside = float(point[d])
             if abs(outside - inside) <= self._resolution[d]:
-                return _End(inside)
+                return _End(inside, meets_limit=self._meets_limit(point))
             step = valley.find_step(side, limit, self._find_longest_step(point, d))
             target = float(np.clip(point[d] + step, 0.0, 1.0))
             if abs(root - 1.0) <= _TOLERANCE:
-                held = np.array(is_at_bounds(point)) & self._is_physical
                 name = self._name_limit(linear, point, d, limit)
-                return _End(target, name, meets_limit=bool(held.any()))
+                return _End(target, name, meets_limit=self._meets_limit(point))
             if not side * inside < side * target < side * outside:
                 target = 0.5 * (inside + outside) if np.isfinite(outside) else target
             point = self._follow(point, valley, d, target - float(point[d]), limit)
@@ -277,6 +277,10 @@ class _EndSearch:
     def _compute_limit(self, d: int) -> float:
         """Compute the value of Q at an end."""
         return float(self._quantiles[d]) ** 2 * (1.0 if self._moves[d] else _JUMP_LIMIT)
+
+    def _meets_limit(self, point: FloatArray) -> bool:
+        """Whether a parameter is at a physical limit at a point."""
+        return bool(np.any(np.array(is_at_bounds(point)) & self._is_physical))
 
     def _name_limit(self, linear: LinearRatio, point: FloatArray, d: int, limit: float) -> str:
         """Name another parameter whose bound ends the valley at a point: without it Q is smaller.
