@@ -10,7 +10,7 @@ from sysid.core.units import format_unit
 from sysid.identifiability.combinations import IdentifiableCombination
 from sysid.judgement.levels import SEPARABLE
 from sysid.models.parameters import BoundSide, Parameter
-from sysid.results.findings import Finding, note
+from sysid.results.findings import Finding, Severity, note
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.estimates import Estimate, Uncertainty
@@ -25,7 +25,7 @@ def find_undetermined(
     """Find what the data do not determine: alone, in combination, or beyond a bound."""
     free, known = [one for one in analysis.estimates if one.is_free], analysis.uncertainty
     yield from _find_bounds(problem, analysis, free, are_residuals_noise=are_residuals_noise)
-    yield from _find_limits(analysis, free)
+    yield from _find_limits(analysis, free, are_residuals_noise=are_residuals_noise)
     yield from _find_unidentifiable(free, () if known is None else known.groups)
     yield from _find_constant_inputs(problem, free)
     if known is not None:
@@ -89,11 +89,14 @@ def _find_bounds(
     )
 
 
-def _find_limits(analysis: Analysis, free: Sequence[Estimate]) -> Iterator[Finding]:
+def _find_limits(
+    analysis: Analysis, free: Sequence[Estimate], *, are_residuals_noise: bool
+) -> Iterator[Finding]:
     """Find estimates at a physical limit, which is a doubt only where the data pull them over it.
 
     The likelihood ratio at a limit that holds is no larger than inside (Self and Liang 1987).
     """
+    severity: Severity = "caution" if are_residuals_noise else "serious"
     for one in free:
         if one.name not in analysis.limits:
             continue
@@ -102,7 +105,7 @@ def _find_limits(analysis: Analysis, free: Sequence[Estimate]) -> Iterator[Findi
             yield Finding(
                 "bound",
                 "identifiability",
-                "caution",
+                severity,
                 brief,
                 f"{_describe_bound(one)}, a limit of the quantity, and the data pull it beyond. "
                 "The model lacks something then, or the record is at fault.",

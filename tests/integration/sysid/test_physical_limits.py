@@ -28,7 +28,9 @@ def draw_record(r: float, seed: int) -> Record:
 
 
 def identify_process(r: float, seed: int = 1, **changes: Any) -> Identification:
-    return identify(MODEL, draw_record(r, seed), QUICK, parameters={"r": changes} if changes else {})
+    return identify(
+        MODEL, draw_record(r, seed), QUICK, parameters={"r": changes} if changes else {}
+    )
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -61,7 +63,9 @@ def test_a_job_that_narrows_the_range_has_a_bound_of_the_search() -> None:
     assert found["r"].status == "at bound"
     (told,) = [one for one in found.findings if one.explanation == "bound"]
     assert told.severity != "note"
-    expected = "Widen the range, or set parameters: {r: {physical: upper}} if it is a physical limit."
+    expected = (
+        "Widen the range, or set parameters: {r: {physical: upper}} if it is a physical limit."
+    )
     assert told.advice == expected
     (warning,) = [one for one in found.warnings if "r lies at its upper bound 0.6" in one]
     assert "set parameters={'r': {'physical': 'upper'}} if" in warning
@@ -73,6 +77,6 @@ def test_data_that_pull_a_parameter_over_its_limit_are_told_as_such() -> None:
     assert found["K"].status == "at bound"
     (told,) = [one for one in found.findings if one.explanation == "bound"]
     assert told.brief == "the data pull K over its physical limit"
-    assert told.severity == "caution"
+    assert told.severity == "serious"
     assert "widen" not in told.sentences
     assert "raise the bound" not in told.sentences
