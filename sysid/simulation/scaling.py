@@ -48,7 +48,7 @@ AT_BOUND = 1e-6
 def is_at_limits(parameters: Sequence[Parameter], point: FloatArray) -> BoolArray:
     """Return which coordinates (D,) in [0, 1] are at a bound that is a physical limit."""
     is_at = np.array(is_at_bounds(point))
-    return np.any(is_at & find_physical_bounds(parameters), axis=0)
+    return np.asarray(np.any(is_at & find_physical_bounds(parameters), axis=0))
 
 
 def find_physical_bounds(parameters: Sequence[Parameter]) -> BoolArray:
