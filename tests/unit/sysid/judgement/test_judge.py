@@ -16,12 +16,13 @@ from sysid.judgement.residual_context import Candidate, ResidualContext, Simulat
 from sysid.models.parse import parse_model
 from sysid.results.findings import Finding, note
 from sysid.uncertainty.analysis import analyse_estimate
-from tests.support.library.defects import CONSTANCY, LATE, SENSOR, TIMES
+from tests.support.library.defects import CONSTANCY, LATE, SENSOR
 from tests.support.library.judged_records import (
     FAST,
     FINE,
     NOISE,
     STEP,
+    TIMES,
     N,
     build_context,
     draw_levels,
@@ -254,11 +255,10 @@ def test_two_experiments_in_one_record_have_the_same_parameters() -> None:
 
 def test_after_a_gap_another_experiment_begins() -> None:
     """The input moved in the gap, so no sample after it says where the plant was."""
-    times = STEP * np.arange(N)
-    u = np.where((times > 100.0) & (times < 130.0), 2.0, draw_levels(1))
+    u = np.where((TIMES > 100.0) & (TIMES < 130.0), 2.0, draw_levels(1))
     y = FAST.respond(hold(u))[::FINE] + NOISE * draw_noise(1)
-    kept = (times < 60.0) | (times > 130.0)
-    record = make_record(u[kept], y[kept], times=times[kept])
+    kept = (TIMES < 60.0) | (TIMES > 130.0)
+    record = make_record(u[kept], y[kept], times=TIMES[kept])
     (first, *_) = explain(FAST, record).findings
     assert first.explanation == "another experiment"
     assert "at about 130.5 s, after a gap" in first.text

@@ -21,6 +21,7 @@ from tests.support.library.judged_records import (
     PLANTS,
     SLOW,
     STEP,
+    TIMES,
     N,
     Process,
     build_context,
@@ -30,8 +31,6 @@ from tests.support.library.judged_records import (
     hold,
     make_record,
 )
-
-TIMES = STEP * np.arange(N)
 
 
 def lag(values: FloatArray, samples: float) -> FloatArray:

@@ -16,6 +16,7 @@ from tests.support.library.judged_records import (
     FINE,
     NOISE,
     STEP,
+    TIMES,
     N,
     build_context,
     draw_levels,
@@ -100,12 +101,12 @@ def test_missing_samples_are_left_out() -> None:
 def test_each_output_has_its_rows() -> None:
     records = []
     for seed in (1, 2):
-        u, times = draw_levels(seed), STEP * np.arange(N)
+        u = draw_levels(seed)
         outputs = tuple(
-            Channel(name, times, 2.0 * u + sign + NOISE * draw_noise(seed + number))
+            Channel(name, TIMES, 2.0 * u + sign + NOISE * draw_noise(seed + number))
             for number, (name, sign) in enumerate((("y", 1.0), ("z", -1.0)))
         )
-        records.append(Record((Channel("u", times, u, hold="zero"),), outputs))
+        records.append(Record((Channel("u", TIMES, u, hold="zero"),), outputs))
     context = build_context(records, TWO_OUTPUTS, {"a": 2.0, "b": 1.0})
     rows = {name: mask for name, mask, _ in context.iterate_outputs()}
     assert [*rows] == ["y", "z"]
@@ -268,18 +269,18 @@ def test_slow_changes_of_a_parameter_are_told_inside_its_scale() -> None:
 
 
 def test_a_jump_of_a_state_acts_on_all_outputs_of_its_experiment() -> None:
-    times = STEP * np.arange(N)
     records = [
         Record(
-            (Channel("u", times, draw_levels(seed)),),
-            (Channel("y", times, draw_noise(seed)), Channel("z", times, draw_noise(seed + 9))),
+            (Channel("u", TIMES, draw_levels(seed)),),
+            (Channel("y", TIMES, draw_noise(seed)), Channel("z", TIMES, draw_noise(seed + 9))),
         )
         for seed in (1, 2)
     ]
     context = build_context(records, TWO_OUTPUTS, {"a": 1.0})
-    slope = np.exp(-np.tile(times, 4))
+    slope = np.exp(-np.tile(TIMES, 4))
     shifted = context.shift_start(slope, 2 * N + 100)  # of y in experiment 2
-    expected = np.where(times >= times[100], np.exp(-(times - times[100])), 0.0)
+    late = TIMES - TIMES[100]
+    expected = np.where(late >= 0.0, np.exp(-late), 0.0)
     for number, part in enumerate(context.parts):
         wanted = expected if part.experiment == 1 else np.zeros(N)
         np.testing.assert_allclose(shifted[part.rows], wanted, err_msg=str(number))
