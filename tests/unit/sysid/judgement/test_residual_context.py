@@ -1,5 +1,6 @@
 """What explanations start from: where something begins, moves, other inputs, names of samples."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from sysid.judgement.judge import explain_residuals
 from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
+from sysid.simulation.problem import Problem
 from tests.support.library.judged_records import (
     FAST,
     FINE,
@@ -124,6 +126,33 @@ def test_the_same_inputs_give_the_same_simulation_and_others_their_response() ->
     np.testing.assert_allclose(higher - context.simulation, a, rtol=1e-9)
     assert context.simulations.spent >= 2
     assert context.problem.records[0].inputs[0].values.max() <= 2.0  # the own record is as it was
+
+
+def begin_inputs_earlier(record: Record) -> Record:
+    """Let the input move for 20 s before the record."""
+    (u,) = record.inputs
+    times = np.concatenate([u.times[0] + STEP * np.arange(-40, 0), u.times])
+    values = np.concatenate([2.0 - draw_levels(8, 40), u.values])
+    return replace(record, inputs=(replace(u, times=times, values=values),))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(lambda one: one.replace_holds({"y": "mean"}), id="outputs that are means"),
+        pytest.param(begin_inputs_earlier, id="inputs that begin earlier"),
+    ],
+)
+def test_records_of_another_form_are_simulated_as_a_problem_that_is_built_of_them(
+    change: Callable[[Record], Record],
+) -> None:
+    context = build_context([draw_record(FAST, 1)], "fopdt", FAST.values, initial="rest")
+    records = [change(record) for record in context.problem.records]
+    built = Problem.build(load_model("fopdt"), records, initial="rest")
+    assert built.free_names == context.problem.free_names
+    expected = built.predict(context.theta[None])[0]
+    np.testing.assert_allclose(context.simulate(records), expected, rtol=1e-12)
+    assert np.max(np.abs(expected - context.simulation)) > NOISE
 
 
 def compare_moves(shift: FloatArray, pattern: FloatArray) -> None:
