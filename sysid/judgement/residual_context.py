@@ -24,11 +24,12 @@ from sysid.kernels.signals.past_reads import is_difference, list_delayed_values
 from sysid.models.model import MAX_SUBSTEPS, replace_substeps
 from sysid.models.ties import collect_parameter_names
 from sysid.residuals.series import ResidualPart, iterate_parts
-from sysid.results.findings import Family, Move
+from sysid.results.findings import Family, Move, list_moves
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.start_values import convert_point
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale
+from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.sensitivities import compute_sensitivities
 
 _EDGE_SHARE = 0.1  # of an experiment at either end, in which no change is looked for
@@ -383,23 +384,21 @@ class ResidualContext:
         )
         fit, d = model.fit(dummies), start.size
         scale = compute_physical_scale(problem, end.theta)
-        values = dict(
-            zip(problem.free_names, end.theta + fit.coefficients[:d] * scale, strict=True)
-        )
-        errors = dict(zip(problem.free_names, fit.errors[:d] * scale, strict=True))
-        known = {estimate.name: estimate for estimate in self.analysis.estimates}
-        moves = _order_moves(
-            Move(
-                name,
-                float(values[name]),
-                float(errors[name]),
-                float(values[name] - self.theta[number]) / stderr,
-            )
-            for number, name in self.parameter_numbers
-            if (stderr := known[name].stderr)
+        values = (end.theta + fit.coefficients[:d] * scale).tolist()
+        errors = (fit.errors[:d] * scale).tolist()
+        moves = list_moves(
+            self._declared_estimates,
+            dict(zip(problem.free_names, values, strict=True)),
+            dict(zip(problem.free_names, errors, strict=True)),
         )
         more = (d - self.theta.size) * np.log(max(self.times.size, 2))
         return Refitted(float(fit.criterion + more), moves)
+
+    @cached_property
+    def _declared_estimates(self) -> list[Estimate]:
+        """Estimates of the parameters that the model declares."""
+        names = {name for _, name in self.parameter_numbers}
+        return [one for one in self.analysis.estimates if one.name in names]
 
     def _has_two_parts(self, moment: float) -> bool:
         """Whether both sides of a moment (s) have enough samples for all parameters."""
@@ -429,30 +428,42 @@ class ResidualContext:
             return None
         if not self.simulations.allow(2 * _FULL_FIT * (d + 1)):
             return None
-        points, columns, residuals = [], [], np.zeros(n)
-        for is_part, span in ((~is_late, (-np.inf, moment)), (is_late, (moment, np.inf))):
-            problem = self._select_span(*span)
-            evaluator = problem.evaluator
-            start = np.clip(self.theta, evaluator.lower, evaluator.upper)
-            (end,) = refine_candidates(problem, [start], _REFIT_STEPS * (d + 1))
-            if end is None:
-                return None
-            slopes = compute_sensitivities(self.problem, end.theta)
-            self.simulations.spent += end.evaluations + slopes.evaluations
-            residuals[is_part] = -slopes.residuals[is_part]
-            columns.append(np.where(is_part[:, None], slopes.columns, 0.0))
-            points.append(end.theta)
+        before = self._fit_span(-np.inf, moment)
+        after = None if before is None else self._fit_span(moment, np.inf)
+        if before is None or after is None:
+            return None
         jumps = [self.shift_start(one, int(np.argmax(is_late))) for one in self.start_slopes]
-        design = np.column_stack([*columns, *jumps])
-        fit = ResidualModel(residuals, design, self.parts).without
+        design = np.column_stack([before.columns, after.columns, *jumps])
+        fit = ResidualModel(before.residuals + after.residuals, design, self.parts).without
         used = design.shape[1] - d + 1
-        scales = [compute_physical_scale(self.problem, point) for point in points]
-        values = [
-            point + fit.coefficients[k * d : (k + 1) * d] * scales[k]
-            for k, point in enumerate(points)
-        ]
-        errors = [fit.errors[k * d : (k + 1) * d] * scales[k] for k in range(2)]
-        known = {estimate.name: estimate for estimate in self.analysis.estimates}
+        values, errors = [], []
+        for number, part in enumerate((before, after)):
+            own = slice(number * d, (number + 1) * d)
+            scale = compute_physical_scale(self.problem, part.theta)
+            values.append(part.theta + fit.coefficients[own] * scale)
+            errors.append(fit.errors[own] * scale)
+        criterion = float(fit.criterion + used * np.log(max(n, 2)))
+        return self._compare_parts(criterion, values, errors)
+
+    def _fit_span(self, begin: float, end: float) -> "_FittedPart | None":
+        """Fit the model from a time up to another one (s), without it; None if that fails."""
+        problem = self._select_span(begin, end)
+        evaluator = problem.evaluator
+        start = np.clip(self.theta, evaluator.lower, evaluator.upper)
+        (found,) = refine_candidates(problem, [start], _REFIT_STEPS * (start.size + 1))
+        if found is None:
+            return None
+        slopes = compute_sensitivities(self.problem, found.theta)
+        self.simulations.spent += found.evaluations + slopes.evaluations
+        is_part = (self.times >= begin) & (self.times < end)
+        residuals = np.where(is_part, -slopes.residuals, 0.0)
+        return _FittedPart(found.theta, residuals, np.where(is_part[:, None], slopes.columns, 0.0))
+
+    def _compare_parts(
+        self, criterion: float, values: Sequence[FloatArray], errors: Sequence[FloatArray]
+    ) -> "Parted":
+        """Compare the parameters (D,) of two parts of a record, and their errors."""
+        known = {one.name: one for one in self._declared_estimates}
         moves, changes = [], []
         for number, name in self.parameter_numbers:
             stderr = known[name].stderr
@@ -465,7 +476,6 @@ class ResidualContext:
             change = float(values[1][number] - values[0][number])
             size = abs(change) / max(float(np.hypot(*(e[number] for e in errors))), 1e-300)
             changes.append((size, name, float(values[0][number]), float(values[1][number])))
-        criterion = float(fit.criterion + used * np.log(max(n, 2)))
         return Parted(criterion, _order_moves(moves), tuple(sorted(changes, reverse=True)))
 
     def scales(self, name: str) -> bool:
@@ -715,7 +725,7 @@ class ResidualContext:
                 yield output.name, rows, format_unit(output.unit)
 
 
-def read_channel(channel: Channel, times: FloatArray, lag: float = 0.0) -> FloatArray:
+def read_channel(channel: Channel, times: FloatArray, lag: float) -> FloatArray:
     """Read a channel at times (n,) of samples, `lag` periods before; missing values are bridged.
 
     A held one is read after its jump.
@@ -762,6 +772,14 @@ def _divide(record: Record, moment: float) -> list[Record]:
         )
         for span in spans
     ]
+
+
+class _FittedPart(NamedTuple):
+    """A point (D,) of a part of a record, its residuals (n,) and slopes (n, D); 0 elsewhere."""
+
+    theta: FloatArray
+    residuals: FloatArray
+    columns: FloatArray
 
 
 class Refitted(NamedTuple):
