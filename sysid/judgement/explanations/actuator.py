@@ -9,11 +9,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from sysid.core.robust import estimate_deviation
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
 from sysid.judgement.residual_context import (
@@ -195,8 +197,8 @@ def _list_smoothings(name: str) -> Iterator[_Change]:
 
 
 def _measure_noise(values: FloatArray) -> float:
-    """Measure the deviation of white noise by the median difference of neighbours."""
-    return 1.4826 * float(np.median(np.abs(np.diff(values)))) / float(np.sqrt(2.0))
+    """Measure the deviation of white noise by the differences of neighbours."""
+    return estimate_deviation(np.diff(values)) / sqrt(2.0)
 
 
 def _round_to_levels(values: FloatArray) -> FloatArray:
