@@ -67,7 +67,7 @@ def _respond(context: ResidualContext, name: str) -> FloatArray | None:
     if not _FEWEST <= len(changes) <= _MOST_SHARE * context.times.size:
         return None
     experiment, first = changes[0]
-    channel = _find_channel(records[experiment], name)
+    [channel] = _find_channel(records[experiment], name)
     size, begin = float(np.ptp(channel.values)), float(channel.times[first])
     pulsed = channel.values.copy()
     pulsed[first - 1] += size
@@ -83,7 +83,7 @@ def _respond(context: ResidualContext, name: str) -> FloatArray | None:
         if p.experiment == experiment
     }
     for number, (where, k) in enumerate(changes):
-        channel = _find_channel(records[where], name)
+        [channel] = _find_channel(records[where], name)
         step = float(channel.values[k] - channel.values[k - 1])
         for part in context.parts:
             if part.experiment == where and part.output in known:
@@ -123,24 +123,26 @@ def _switch_early(records: tuple[Record, ...], name: str, early: FloatArray) -> 
     early = np.clip(early, 0.0, _LATEST)
     moved, count = [], 0
     for record in records:
-        channel, changes = _find_channel(record, name), _find_changes(record, name)
-        times = channel.times.copy()
-        own = early[count : count + changes.size]
-        times[changes] -= own * (times[changes] - times[changes - 1])
-        count += changes.size
-        moved.append(_replace_channel(record, replace(channel, times=times)))
+        for channel in _find_channel(record, name):
+            changes = _find_changes(record, name)
+            times = channel.times.copy()
+            own = early[count : count + changes.size]
+            times[changes] -= own * (times[changes] - times[changes - 1])
+            count += changes.size
+            record = _replace_channel(record, replace(channel, times=times))
+        moved.append(record)
     return moved
 
 
 def _find_changes(record: Record, name: str) -> IntArray:
     """Find the samples of an input that differ from those before, but for those after a gap."""
-    one = _find_channel(record, name)
-    return np.flatnonzero((np.diff(one.values) != 0) & ~find_gaps(one.times)) + 1
+    for one in _find_channel(record, name):
+        return np.flatnonzero((np.diff(one.values) != 0) & ~find_gaps(one.times)) + 1
+    return np.zeros(0, dtype=np.int64)
 
 
-def _find_channel(record: Record, name: str) -> Channel:
-    [channel] = [one for one in record.inputs if one.name == name]
-    return replace(channel, hold=channel.effective_hold)
+def _find_channel(record: Record, name: str) -> list[Channel]:
+    return [replace(one, hold=one.effective_hold) for one in record.inputs if one.name == name]
 
 
 def _replace_channel(record: Record, channel: Channel) -> Record:
