@@ -32,14 +32,21 @@ from sysid.uncertainty.analysis import Analysis, compute_physical_scale
 from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.sensitivities import compute_sensitivities
 
-_EDGE_SHARE = 0.1  # of an experiment at either end, in which no change is looked for
+_EDGE_SHARE = 0.1
+"""Of an experiment at either end, in which no change is looked for. Andrews (1993) takes 0.15."""
 _REFIT_STEPS = 12  # of least squares, from the estimate
 _AFTER = 0.01  # of a period: a held input has jumped then
 _MOST_STATES = 8  # whose starts are looked at
 _FINER = 4  # times as many integration steps
-_GAP = 30.0  # median intervals: an interval that is a gap of the record
+_GAP = 30.0
+"""Median intervals: a longer one is a gap of the record. Intervals between random times are
+exponential, and exceed g medians with probability 2**-g. So a million of them have a longer one in
+a record of a thousand (`UNLIKELY`). Measured with `benchmarks.judgement`, over eight kinds with
+missing rows, uneven stamps or joined records: 10 to 100 give the same verdicts in 32 of 32."""
+_MOST_GAPS = 2
+"""After which another experiment may begin; each takes two full fits. In those records, and in one
+of each of the 102 kinds, 1 to 4 of them give the same verdicts."""
 _LONGER = 2.0  # times the time lags: they may be longer with another experiment
-_MOST_GAPS = 2  # after which another experiment may begin
 _PART_SAMPLES = 4  # of a part of a record, for each parameter
 _BACK_SHARE = 0.5  # of the size of an outlier: so much of it may be left a sample later
 _SHOCKS = 3  # innovations that are looked at
@@ -47,6 +54,10 @@ _START_SIMULATIONS, _MOST_START_SIMULATIONS = 3, 13  # of the slopes in a start
 _FULL_FIT = 20  # simulations of a full fit and its slopes, for each parameter and one
 _MOST_POWER = 50.0  # of e: a move that is no number is no move
 _SCALED_SHARE = 0.01  # of a column that a scale and an offset of the output do not explain
+"""Measured with `benchmarks.judgement`, a record of each of 102 kinds, all values changed at once.
+With an `_EDGE_SHARE` of 0.05, a `_LONGER` of 1, `_PART_SAMPLES` 2, a `_BACK_SHARE` of 0.25, one
+shock and a share of 0.001, all statuses stay. With 0.15, 4, 8, 0.75, six and 0.05, three records
+have other statuses. In both, each verdict keeps its first word."""
 _OWN_SHARE = 1e-6  # of a column that no parameter explains: less says nothing
 
 AS_TOLD, TO_THE_NEXT = 1.5, 3.0
