@@ -176,3 +176,11 @@ def test_a_value_out_of_bounds_is_no_reason() -> None:
     moved = replace(ORDER, moves=(Move("L", -1.0, 0.02, -90.0),))
     (_, lag), _ = conclude(moved)
     assert (lag.status, lag.reason) == ("dependent", "the data prefer sopdt")
+
+
+@pytest.mark.parametrize(("gain", "first"), [(200.0, CONSTANT), (300.0, None)])
+def test_why_a_model_fails_takes_half_of_what_it_leaves(gain: float, first: Finding | None) -> None:
+    """Half of the variance of 400 samples is a gain of 400 ln 2 = 277."""
+    step = replace(ORDER, explanation="step of a sensor", gain=gain)
+    assert order_findings([step, CONSTANT], 400)[0] == (first or step)
+    assert order_findings([step, ORDER], 400)[0] == step  # no model fails

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sysid.judgement.explanations import constancy, reading
 from sysid.judgement.judge import explain_residuals
 from sysid.judgement.levels import DEFECT_GAIN
 from sysid.models.catalogue.load import load_model
@@ -28,6 +29,8 @@ from tests.support.library.judged_records import (
     NOISE,
     PLANTS,
     SLOW,
+    TIMES,
+    N,
     Process,
     build_context,
     draw_levels,
@@ -200,3 +203,21 @@ def test_a_change_is_not_looked_for_where_a_record_begins() -> None:
     moments = [moment for moment, *_ in context.find_late(np.ones(context.times.size))]
     assert context.times[150] in moments
     assert context.times[2] not in moments
+
+
+def test_an_offset_of_the_output_changes_as_its_sensor_does() -> None:
+    context = build_context([draw_record(FAST, 1)], "fopdt", FAST.values)
+    briefs = [one.brief for one in constancy.propose(context)]
+    assert any(brief.startswith("K changes") for brief in briefs)
+    assert not any(brief.startswith("y0") for brief in briefs)
+
+
+@pytest.mark.parametrize("is_regular", [True, False])
+def test_means_have_periods_so_irregular_samples_are_none(is_regular: bool) -> None:
+    u = draw_levels(1)
+    uneven = np.sort(np.random.default_rng(1).uniform(0.0, TIMES[-1], N))
+    record = make_record(u, FAST.respond(hold(u))[::FINE], times=TIMES if is_regular else uneven)
+    context = build_context([record], "fopdt", FAST.values)
+    settings = [one.setting for one in reading.propose(context)]
+    expected = ["Use hold: {u: first}.", "Use hold: {u: mean}.", "", "Use hold: {y: mean-after}."]
+    assert settings == ([*expected, "Use hold: {y: mean}."] if is_regular else ["", ""])

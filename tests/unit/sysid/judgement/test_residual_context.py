@@ -349,3 +349,31 @@ def test_a_parameter_that_the_data_push_over_its_bound_stays_there(
     moves = {move.parameter for move in context.compute_moves(fit)}
     assert (fit.coefficients[0] == 0.0) == is_held
     assert moves == ({"b"} if is_held else {"a", "b"})
+
+
+def test_a_part_of_a_record_has_samples_for_all_parameters_and_begins_at_no_outlier() -> None:
+    u = draw_levels(1)
+    y = FAST.respond(hold(u))[::FINE] + NOISE * draw_noise(1)
+    y[200] += 20.0 * NOISE
+    context = build_context([make_record(u, y)], "fopdt", FAST.values)
+    assert context.refit_experiments(TIMES[200]) is None
+    for few in (5, N - 5):
+        assert context.refit_experiments(TIMES[few]) is None
+        assert context.refit_parts(TIMES[few]) is None
+    assert context.refit_experiments(TIMES[240]) is not None
+
+
+def test_the_start_of_another_experiment_counts_as_a_parameter() -> None:
+    record = draw_record(FAST, 1)
+    context = build_context([record], "fopdt", FAST.values, initial="free")
+    (u,), (y,) = record.inputs, record.outputs
+    parts = [
+        make_record(u.values[rows], y.values[rows], times=TIMES[rows])
+        for rows in (slice(210), slice(210, None))
+    ]
+    apart = build_context(parts, "fopdt", FAST.values, initial="free")
+    assert apart.theta.size == context.theta.size + 1
+    found = context.refit_experiments(TIMES[210])
+    assert found is not None
+    expected = apart.residual_model.without.criterion + np.log(N)
+    assert found.criterion == pytest.approx(expected, abs=0.1)
