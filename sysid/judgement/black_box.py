@@ -43,6 +43,8 @@ _CONVERGED = 1e-3  # relative decrease of the squares
 _DIFFERENCE = 1e-3  # of a step or a logarithm, for slopes by differences
 _MOST_MOVE = (3.0, 1.0, 1.0)  # of a delay in steps, and of logarithms
 _RIDGE = 1e-9  # of the square of a column, against rounding
+"""Measured with `benchmarks.judgement`, a record of each of 102 kinds: `_MOST_POLES` of 3 or 6,
+`_LEAST_SHARE` of 0.3 or 0.7 and `_SPACING` of 0.9 or 0.4 leave all statuses."""
 
 
 class Samples(NamedTuple):
