@@ -24,6 +24,7 @@ from sysid.judgement.explanations.noise import (
     find_disagreement_of_frequencies,
     find_noise,
 )
+from sysid.judgement.full_fits import refit, refit_experiments, refit_parts
 from sysid.judgement.levels import (
     ADDED_SHARE,
     BENT_SHARE,
@@ -286,7 +287,7 @@ def _refit_finalists(
         if name in tried or not one.candidate.is_refitted:
             continue
         tried[name] = position
-        found = context.refit(one.candidate.change)
+        found = refit(context, one.candidate.change)
         if found is None:
             continue
         added = one.candidate.columns.shape[1] + one.candidate.counted
@@ -320,7 +321,7 @@ def _divide_finalist(
     context: ResidualContext, likeliest: _Scored, moment: float, criterion: float
 ) -> list[_Scored]:
     """Let another experiment begin at a moment (s), which counts as a parameter."""
-    found = context.refit_experiments(moment)
+    found = refit_experiments(context, moment)
     if found is None:
         return []
     gain = float(criterion - found.criterion - np.log(max(context.times.size, 2)))
@@ -343,7 +344,7 @@ def _part_finalist(
     context: ResidualContext, likeliest: _Scored, moment: float, criterion: float
 ) -> list[_Scored]:
     """Fit both sides of the moment (s) of the likeliest change by themselves."""
-    found = context.refit_parts(moment)
+    found = refit_parts(context, moment)
     if found is None:
         return []
     gain = criterion - found.criterion
