@@ -505,8 +505,7 @@ class ResidualContext:
 
         Not at the ends of an experiment: what is wrong there is its start.
         """
-        places = {int(row): position for position, row in enumerate(self._order)}
-        positions = [places[row] for row in self.find_shocks()]
+        positions = np.argsort(self._order)[self.find_shocks()].tolist()
         return [self._begin_late(column, one) for one in positions if self._may_break[one]]
 
     def _begin_late(self, column: FloatArray, position: int) -> tuple[float, FloatArray, str]:
