@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.judgement.explanations import constancy, reading
+from sysid.core.types import FloatArray
+from sysid.judgement.explanations import constancy, history, reading
 from sysid.judgement.judge import explain_residuals
 from sysid.judgement.levels import DEFECT_GAIN
 from sysid.models.catalogue.load import load_model
@@ -221,3 +222,34 @@ def test_means_have_periods_so_irregular_samples_are_none(is_regular: bool) -> N
     settings = [one.setting for one in reading.propose(context)]
     expected = ["Use hold: {u: first}.", "Use hold: {u: mean}.", "", "Use hold: {y: mean-after}."]
     assert settings == ([*expected, "Use hold: {y: mean}."] if is_regular else ["", ""])
+
+
+@pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.model)
+def test_a_sensor_that_is_stuck_for_a_short_time_is_named(plant: Process) -> None:
+    def stick(y: FloatArray) -> FloatArray:
+        return np.where((np.arange(N) >= 100) & (np.arange(N) < 116), y[100], y)
+
+    found = explain_output(plant, 1, stick).findings
+    assert found[0].explanation == "repeated reading"
+
+
+def test_outliers_at_the_end_are_no_variance_that_follows_time() -> None:
+    def spoil(y: FloatArray) -> FloatArray:
+        late = np.arange(N - 36, N, 3)
+        spoilt = y.copy()
+        spoilt[late] += 20.0 * NOISE * np.resize([1.0, -1.0], late.size)
+        return spoilt
+
+    names = list_names(explain_output(FAST, 1, spoil))
+    assert "outliers" in names
+    assert "unequal variance" not in names
+
+
+def test_what_is_tried_of_a_start_is_what_is_advised() -> None:
+    context = build_context([draw_record(FAST, 1)], "fopdt", FAST.values, initial="rest")
+    skipped = [
+        (one.change, re.search(r"skip: (\d+)", one.setting)) for one in history.propose(context)
+    ]
+    assert any(told for _, told in skipped)
+    for change, told in skipped:
+        assert change.get("skip") == (int(told[1]) if told else None)

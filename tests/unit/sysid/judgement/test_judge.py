@@ -406,3 +406,32 @@ def test_samples_of_repeats_are_no_series() -> None:
             build_context([record], parse_model(LINE), {"a": 2.0, "b": 1.0})
         )
         assert explained.is_done is bool(explained.findings) is (repeats is None)
+
+
+@pytest.mark.parametrize(("size", "is_cure"), [(0.0, True), (0.008, False)])
+def test_a_cure_leaves_nothing_that_may_be_a_defect(
+    size: float, is_cure: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Something with strong odds is left, but not with those of a defect."""
+
+    def propose_wave(context: ResidualContext) -> Iterator[Candidate]:
+        columns = context.weigh(np.sin(TIMES))
+        yield Candidate("a wave", "structure", columns, "it waves", "it waves")
+
+    use_proposers(monkeypatch, propose_wave)
+    u = draw_levels(1)
+    y = 2.0 * u + 1.0 + NOISE * draw_noise(1) + size * np.sin(TIMES)
+    context = build_context([make_record(u, y)], parse_model(LINE), {"a": 2.0, "b": 1.0})
+    explained = explain_residuals(context)
+    assert explained.is_done
+    assert explained.is_doubtful is not is_cure
+    assert explained.findings == ()
+    assert leaves_noise(context.problem, context.theta, Simulations()) is is_cure
+
+
+def test_another_order_takes_the_place_of_its_columns() -> None:
+    columns = [make_finding(name, 30.0, "L") for name in ("one more time constant", "outliers")]
+    order = make_finding("order", 28.0, "L")
+    assert select_explanations(columns, [order]) == (columns[1], order)
+    weak = make_finding("order", 11.0, "L")
+    assert select_explanations(columns, [weak]) == tuple(columns)

@@ -9,10 +9,11 @@ import pytest
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.judgement.judge import explain_residuals
-from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
+from sysid.judgement.residual_context import ResidualContext, find_delay_parameters, find_held
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
+from sysid.uncertainty.sensitivities import compute_sensitivities
 from tests.support.library.judged_records import (
     FAST,
     FINE,
@@ -317,3 +318,16 @@ def test_a_parameter_that_the_data_push_over_its_bound_stays_there(
     moves = {move.parameter for move in context.compute_moves(fit)}
     assert (fit.coefficients[0] == 0.0) == is_held
     assert moves == ({"b"} if is_held else {"a", "b"})
+
+
+@pytest.mark.parametrize(("true", "is_held"), [(1.5, True), (2.5, False)])
+def test_a_bound_holds_a_parameter_only_if_the_data_push_it_over(
+    true: float, is_held: bool
+) -> None:
+    u = draw_levels(1)
+    record = make_record(u, true * u + 1.0 + NOISE * draw_noise(1))
+    problem = Problem.build(parse_model(LINE), [record], parameters={"a": {"lower": 2.0}})
+    theta = np.array([2.0, 1.0])
+    slopes = compute_sensitivities(problem, theta)
+    held = find_held(problem, theta, -slopes.residuals, slopes.columns)
+    assert held.tolist() == [is_held, False]
