@@ -191,7 +191,9 @@ def _build_identification(
     measures = compares_orders and not is_white and not feedback
     yardstick = fit_yardstick(problem, simulated) if measures else None
     is_of_the_solver = metrics.rms <= SOLVER_SHARE * problem.output_scale
-    simulations = Simulations(budget.count_left(), deadline.is_past_grace)
+    # A sweep's run tries no setting: that is done when somebody opens it.
+    left = budget.count_left() if compares_orders else 0
+    simulations = Simulations(left, deadline.is_past_grace)
     explanations = (
         ()
         if feedback

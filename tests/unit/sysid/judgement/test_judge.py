@@ -124,7 +124,7 @@ def test_a_run_that_diverges_explains_nothing(size: float, monkeypatch: pytest.M
         yield Candidate("curve of an actuator", "actuator", columns, "a curve", "a curve")
 
     expected = explain_line(LATE)
-    monkeypatch.setattr(judge, "_PROPOSERS", (*judge._PROPOSERS, propose_diverged))
+    monkeypatch.setattr(judge, "_CHEAP_PROPOSERS", (*judge._CHEAP_PROPOSERS, propose_diverged))
     assert explain_line(LATE) == expected
 
 
