@@ -84,12 +84,13 @@ class Explained(NamedTuple):
     """Findings about residuals; `is_done`: whether all explanations were looked for.
 
     `is_doubtful`: something has strong odds against noise alone, but not those of a defect. Or
-    not all were looked for.
+    not all were looked for. `is_of_the_solver`: the residuals are errors of the integration.
     """
 
     findings: tuple[Finding, ...] = ()
     is_done: bool = False
     is_doubtful: bool = False
+    is_of_the_solver: bool = False
 
     @property
     def is_noise(self) -> bool:
@@ -113,6 +114,8 @@ def explain_residuals(context: ResidualContext) -> Explained:
     """
     if not _is_possible(context):
         return Explained(is_doubtful=context.simulations.is_cut_short)
+    if context.is_of_the_solver:
+        return Explained(is_done=True, is_doubtful=True, is_of_the_solver=True)
     scored = _score_at_once(context, (*_FREE_PROPOSERS, *_CHEAP_PROPOSERS))
     return _explain(context, scored, advises=True)
 

@@ -27,6 +27,7 @@ from sysid.residuals.series import ResidualPart, iterate_parts
 from sysid.results.findings import Family, Move
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
+from sysid.simulation.scaling import is_at_bounds, to_unit
 from sysid.simulation.start_values import convert_point
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale
 from sysid.uncertainty.sensitivities import compute_sensitivities
@@ -35,7 +36,8 @@ _EDGE_SHARE = 0.1  # of an experiment at either end, in which no change is looke
 _REFIT_STEPS = 12  # of least squares, from the estimate
 _AFTER = 0.01  # of a period: a held input has jumped then
 _MOST_STATES = 8  # whose starts are looked at
-_FINER = 4  # times as many integration steps
+_FINER = 4  # times as many integration steps; three times where no more are allowed
+_LEFT_BY_FINER = 4.0  # finer steps by 3 leave ½ of what they take out, at order 1: in squares ¼
 _GAP = 30.0  # median intervals: an interval that is a gap of the record
 _LONGER = 2.0  # times the time lags: they may be longer with another experiment
 _MOST_GAPS = 2  # after which another experiment may begin
@@ -220,20 +222,40 @@ class ResidualContext:
         Errors of the integration are taken out first. They are the program's, and no defect: an
         input that jumps inside a step leaves one, and under coloured noise even a small one shows.
         A record that was simulated with the same steps has none: then they stay, by the criterion.
+
+        A parameter that the data push over its bound has no column. Where a bound holds, the
+        tangent space of a model is that of the others (Chernoff, Ann. Math. Stat. 25 (1954) 573).
         """
         assert self.analysis.residuals_and_sensitivities is not None
         error, columns = self.analysis.residuals_and_sensitivities
+        columns = np.where(self._is_held, 0.0, columns)
         plain = ResidualModel(-error, columns, self.parts)
         if not self._integration_error.any():
             return plain
-        exact = ResidualModel(-error - self._integration_error, columns, self.parts)
+        left = float(np.mean(np.square(self._integration_error))) / _LEFT_BY_FINER
+        exact = ResidualModel(-error - self._integration_error, columns, self.parts, left)
         return min(exact, plain, key=lambda model: model.without.criterion)
+
+    @property
+    def is_of_the_solver(self) -> bool:
+        """Whether the residuals are no larger than what the integration's steps leave."""
+        model = self.residual_model
+        return float(np.mean(np.square(model.residuals))) <= model.least
+
+    @cached_property
+    def _is_held(self) -> BoolArray:
+        """Which parameters (D,) a bound holds."""
+        assert self.analysis.residuals_and_sensitivities is not None
+        error, columns = self.analysis.residuals_and_sensitivities
+        return _find_held(self.problem, self.theta, -error, columns)
 
     def take(self, columns: FloatArray) -> "ResidualContext":
         """Return the context beside columns (n, q), as if they were those of parameters."""
         other, model = copy(self), self.residual_model
         joined = np.hstack([model.columns, columns])
-        vars(other)["residual_model"] = ResidualModel(model.residuals, joined, self.parts)
+        vars(other)["residual_model"] = ResidualModel(
+            model.residuals, joined, self.parts, model.least
+        )
         vars(other).pop("_bases", None)
         return other
 
@@ -242,8 +264,8 @@ class ResidualContext:
         """What a finer step adds to the weighted outputs (n,)."""
         nothing = np.zeros(self.times.size)
         model = self.problem.untied_model
-        steps = _FINER * model.solver.substeps
-        if is_difference(model) or steps > MAX_SUBSTEPS:
+        steps = min(_FINER * model.solver.substeps, MAX_SUBSTEPS)
+        if is_difference(model) or steps < (_FINER - 1) * model.solver.substeps:
             return nothing
         try:
             finer = self.problem.rebuild(
@@ -299,7 +321,7 @@ class ResidualContext:
                 float(end - start[number]) / stderr,
             )
             for number, name in self.parameter_numbers
-            if (stderr := known[name].stderr)
+            if (stderr := known[name].stderr) and not self._is_held[number]
             for end in ends[number]
         )
 
@@ -378,15 +400,19 @@ class ResidualContext:
             return None
         sensitivities = compute_sensitivities(problem, end.theta)
         self.simulations.spent += end.evaluations + sensitivities.evaluations
-        model = ResidualModel(
-            -sensitivities.residuals, sensitivities.columns, list(iterate_parts(problem))
-        )
-        fit, d = model.fit(dummies), start.size
+        residuals, columns = -sensitivities.residuals, sensitivities.columns
+        is_held = _find_held(problem, end.theta, residuals, columns)
+        parts, d = list(iterate_parts(problem)), start.size
+        fit = ResidualModel(residuals, np.where(is_held, 0.0, columns), parts).fit(dummies)
+        errors_of_all = fit.errors[:d]
+        if is_held.any():  # at a bound, the error is that of the linear model
+            beyond = ResidualModel(residuals, columns, parts).fit(dummies)
+            errors_of_all = np.where(is_held, beyond.errors[:d], errors_of_all)
         scale = compute_physical_scale(problem, end.theta)
         values = dict(
             zip(problem.free_names, end.theta + fit.coefficients[:d] * scale, strict=True)
         )
-        errors = dict(zip(problem.free_names, fit.errors[:d] * scale, strict=True))
+        errors = dict(zip(problem.free_names, errors_of_all * scale, strict=True))
         known = {estimate.name: estimate for estimate in self.analysis.estimates}
         moves = _order_moves(
             Move(
@@ -713,6 +739,26 @@ class ResidualContext:
                     rows[part.rows] = True
             if rows.any():
                 yield output.name, rows, format_unit(output.unit)
+
+
+def _find_held(
+    problem: Problem, theta: FloatArray, residuals: FloatArray, columns: FloatArray
+) -> BoolArray:
+    """Find which parameters (D,) lie at a bound that the data push them over.
+
+    One after another, as an active set: a parameter that is held changes what the others want.
+    """
+    parts = list(iterate_parts(problem))
+    is_low, is_high = is_at_bounds(to_unit(problem.evaluator, theta[None])[0])
+    is_held = np.zeros(theta.size, dtype=np.bool_)
+    while np.any((is_low | is_high) & ~is_held):
+        free = ResidualModel(residuals, np.where(is_held, 0.0, columns), parts)
+        step = free.without.coefficients
+        is_pushed = ~is_held & ((is_low & (step < 0.0)) | (is_high & (step > 0.0)))
+        if not is_pushed.any():
+            break
+        is_held |= is_pushed
+    return is_held
 
 
 def read_channel(channel: Channel, times: FloatArray, lag: float = 0.0) -> FloatArray:

@@ -301,3 +301,21 @@ def test_both_parts_of_a_record_are_fitted_by_themselves(before: float, after: f
     assert size > 20.0
     assert values == pytest.approx([before, after], abs=0.1)
     assert context.residual_model.without.criterion - found.criterion > 500.0
+
+
+@pytest.mark.parametrize(("slope", "is_held"), [(2.3, True), (1.7, False)])
+def test_a_parameter_that_the_data_push_over_its_bound_stays_there(
+    slope: float, is_held: bool
+) -> None:
+    """Its bound is 2. Where the data pull it inwards again, it has its column."""
+    u = draw_levels(0, N)
+    document = LINE | {"parameters": LINE["parameters"] | {"a": {"lower": -1.0, "upper": 2.0}}}
+    context = build_context(
+        [make_record(u, slope * u + 1.0 + NOISE * draw_noise(0))],
+        parse_model(document),
+        {"a": 2.0, "b": 1.0},
+    )
+    fit = context.residual_model.without
+    moves = {move.parameter for move in context.compute_moves(fit)}
+    assert (fit.coefficients[0] == 0.0) == is_held
+    assert moves == ({"b"} if is_held else {"a", "b"})
