@@ -463,7 +463,7 @@ def _scan_delays(section: _Section, products: FloatArray, correlations: FloatArr
     grams = products - fixed @ fixed.transpose(0, 2, 1)
     grams += 1e-6 * np.diag(np.maximum(sizes, 1e-300))
     if section.order == 1:
-        return np.square(own[0]) / grams[:, 0, 0]
+        return np.asarray(np.square(own[0]) / grams[:, 0, 0])
     (first, shared), (_, second) = grams.transpose(1, 2, 0)
     along = second * own[0] ** 2 + first * own[1] ** 2 - 2.0 * shared * own[0] * own[1]
     return np.asarray(along / (first * second - shared**2))

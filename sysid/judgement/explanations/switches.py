@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise, product
-from math import ceil
+from math import ceil, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +29,7 @@ _PRECISION = 12.0  # 1 over the variance of what is uniform over a period
 _ROUNDS = 3  # of the estimate: a pulse does not grow from its end
 _LATEST = 0.999  # of a period: the order of the samples stays
 _FORGOTTEN = 1e-6  # of a pulse: a smaller rest of it is not looked at
+_MOST_PRODUCTS = 1 << 32  # of numbers, for each input: less than a second
 _FEWEST_IN_GROUP = 64  # changes: smaller matrices take no less time
 _ROUNDING = 1e-12  # of the largest eigenvalue of ZᵀZ: less is rounding
 
@@ -70,7 +71,11 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
 
 
 def _respond(context: ResidualContext, name: str) -> "_Responses | None":
-    """Compute what each change adds a period early; None if it cannot be told."""
+    """Compute what each change adds a period early; None if it cannot be told.
+
+    If a plant forgets so slowly that products of all changes take long, the first ones count. Each
+    speaks for itself, so hundreds of them suffice.
+    """
     records = context.problem.records
     changes = [_find_changes(one, name) for one in records]
     count = sum(found.size for found in changes)
@@ -93,14 +98,19 @@ def _respond(context: ResidualContext, name: str) -> "_Responses | None":
         if p.experiment == experiment
     }
     reach = max(one.reach for one in known.values())
+    placed = [channel for one in records for channel in _find_channel(one, name)]
+    moments = [channel.times[found] for channel, found in zip(placed, changes, strict=True)]
+    length = max([_FEWEST_IN_GROUP, *(_count_together(times, reach) for times in moments)])
+    most, left = count, _MOST_PRODUCTS / context.times.size
+    if count * length > left:
+        most = length = int(sqrt(left))
     groups = list[_Group]()
-    for number, found in enumerate(changes):
+    for number, (channel, found) in enumerate(zip(placed, changes, strict=True)):
         parts = [p for p in context.parts if p.experiment == number and p.output in known]
+        found, times = found[:most], moments[number][:most]
+        most -= found.size
         if found.size:
-            [channel] = _find_channel(records[number], name)
-            times, steps = channel.times[found], np.diff(channel.values)[found - 1]
-            most = np.searchsorted(times, times + reach, side="right") - np.arange(found.size)
-            length = max(int(np.max(most)), _FEWEST_IN_GROUP)
+            steps = np.diff(channel.values)[found - 1]
             for own in (slice(k, k + length) for k in range(0, found.size, length)):
                 blocks = [known[p.output].move(p, times[own], steps[own], reach) for p in parts]
                 nothing = slice(0, 0), np.zeros((0, times[own].size))
@@ -111,6 +121,12 @@ def _respond(context: ResidualContext, name: str) -> "_Responses | None":
                     ]
                 )
     return _Responses(context.times.size, groups)
+
+
+def _count_together(times: FloatArray, reach: float) -> int:
+    """Count the changes at most, at times (q,), whose pulses are not forgotten at a time."""
+    ends = np.searchsorted(times, times + reach, side="right")
+    return int(np.max(ends - np.arange(times.size), initial=0))
 
 
 class _Pulse(NamedTuple):
@@ -183,7 +199,7 @@ class _Responses:
                 left = self._beside[number - 1].T @ solved[-1]
                 matrix, values = matrix - left[:, k:], values - left[:, :k]
             after = self._beside[number : number + 1]
-            solved.append(np.linalg.solve(matrix, np.hstack([values, *after])))
+            solved.append(np.asarray(np.linalg.solve(matrix, np.hstack([values, *after]))))
             spread += float(np.linalg.slogdet(matrix)[1])
         found = [solved[-1]]
         for one in solved[-2::-1]:
@@ -236,14 +252,16 @@ def _estimate_early(
 
 
 def _switch_early(records: tuple[Record, ...], name: str, early: FloatArray) -> list[Record]:
-    """Let each change of an input come early, by (q,) in periods, within one."""
+    """Let each change of an input come early, by (q,) in periods, within one; others by half."""
     early = np.clip(early, 0.0, _LATEST)
     moved, count = [], 0
     for record in records:
         for channel in _find_channel(record, name):
             changes = _find_changes(record, name)
             times = channel.times.copy()
-            own = early[count : count + changes.size]
+            own = np.full(changes.size, 0.5)
+            known = early[count : count + changes.size]
+            own[: known.size] = known
             times[changes] -= own * (times[changes] - times[changes - 1])
             count += changes.size
             record = _replace_channel(record, replace(channel, times=times))
