@@ -582,10 +582,9 @@ class FieldOrigins:
         """Rewrite a note so that it names options instead of job fields."""
         return rewrite_settings(note, self._format_setting)
 
-    def _format_setting(self, field: str, entries: Mapping[str, str]) -> str:
+    def _format_setting(self, place: Sequence[str], entries: Mapping[str, str]) -> str:
         origins = {
-            self.locate(join_pointer(*filter(None, (field, name)))): value
-            for name, value in entries.items()
+            self.locate(join_pointer(*place, name)): value for name, value in entries.items()
         }
         return " ".join(
             f"{origin}{'=' if origin.startswith('--set ') else ' '}{value}"

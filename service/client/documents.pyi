@@ -660,7 +660,7 @@ class FindingDocument(TypedDict):
     moves: list[MoveDocument]
     """what each parameter would be, the furthest move first"""
     parameters: list[str]
-    """parameters that it makes doubtful"""
+    """parameters that it makes doubtful; those that a note is about"""
     status: Literal[
         "identified",
         "not settled",
@@ -1171,6 +1171,8 @@ class ModelParameterDocument(TypedDict):
     """value at which it is held, in `unit`"""
     tied: NotRequired[str | None]
     """expression that gives its value"""
+    physical: NotRequired[str | None]
+    """bounds that are limits of the quantity: lower, upper or both"""
 
 class MoveDocument(TypedDict):
     """What a parameter would be under an explanation."""
@@ -1301,6 +1303,8 @@ class ParameterInDocument(TypedDict):
     """value at which the parameter is held, in its unit"""
     tied: NotRequired[str | None]
     """expression of other parameters that gives the value"""
+    physical: NotRequired[Literal["lower", "upper", "both"] | None]
+    """bounds that are limits of the quantity itself"""
 
 class ParameterSummaryDocument(TypedDict):
     """Summary of one parameter over the runs of a group, in its unit."""

@@ -161,7 +161,9 @@ def _build_identification(
         left, late = budget.count_left(), deadline.is_past_grace
         orders, spent = compare_orders(problem, theta, analysis.estimates, left, late)
         budget.spend(spent)
-    doubts = find_hold_doubts(problem, holds, simulated, best.lowest_end.rms)
+    simulations = Simulations(budget.count_left(), deadline.is_past_grace)
+    doubts = find_hold_doubts(problem, holds, theta, simulated, best.lowest_end.rms, simulations)
+    budget.spend(simulations.spent)
     posterior = None
     if has_posterior:
         others = [minimum.values for minimum in minima.minima if minimum.is_compatible]
@@ -177,10 +179,10 @@ def _build_identification(
         left,
         late,
         has_feedback=bool(feedback),
-        doubtful=[hold for hold, doubt in zip(holds, doubts, strict=True) if doubt],
+        doubtful=[hold for hold, doubt in zip(holds, doubts, strict=True) if doubt.text],
     )
     budget.spend(spent)
-    estimates, rms = analysis.estimates, best.lowest_end.rms
+    estimates = analysis.estimates
     are_noise = is_explained(
         problem,
         metrics.rms,
@@ -203,7 +205,7 @@ def _build_identification(
             () if is_of_the_solver else explained.findings,
             [
                 *find_other_orders(orders, problem.model.name, estimates),
-                *find_other_readings(problem, holds, doubts, estimates, rms, simulations),
+                *find_other_readings(problem, holds, doubts, estimates, simulations),
                 *find_open_starts(best.starts, estimates),
             ],
         )

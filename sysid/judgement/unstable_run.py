@@ -44,8 +44,8 @@ from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.sensitivities import compute_sensitivities
 
-_MIN_GROWTH = 10.0
-_MOST_SIMULATIONS = 3000
+_MIN_GROWTH = 10.0  # of the effect of a start: a double integrator reaches three
+_MOST_SIMULATIONS = 3000  # of the fit to predictions: with fewer left, none is made
 
 
 class OneStepComparison(NamedTuple):

@@ -12,7 +12,7 @@ from sysid.core.settings import (
     GeneticAlgorithm,
     Loss,
 )
-from sysid.data.holds import HOLDS, OUTPUT_HOLDS
+from sysid.data.holds import HOLDS, MEANS
 
 NAMES: Mapping[str, Sequence[str]] = {
     "method": SEARCH_METHODS,
@@ -20,7 +20,7 @@ NAMES: Mapping[str, Sequence[str]] = {
     "noise_model": NOISE_MODELS,
     "prediction": PREDICTION_KINDS,
     "hold": HOLDS,
-    "output_hold": OUTPUT_HOLDS[1:],
+    "output_hold": MEANS,
     "initial": INITIAL_SETTINGS,
 }
 """Names to choose from, by the field of the form."""
@@ -67,16 +67,22 @@ def list_choices() -> dict[str, list[tuple[str, str]]]:
     }
 
 
-def write_choice(field: str, entries: Mapping[str, str]) -> str:
+def write_choice(place: Sequence[str], entries: Mapping[str, str]) -> str:
     """Write a setting of a note as the form has it: the field's label and the chosen text.
 
-    >>> write_choice("hold", {"u": "zero"})
+    That of a parameter is one of the model as text.
+
+    >>> write_choice(["hold"], {"u": "zero"})
     '“u between samples: held (zero)”'
+    >>> write_choice(["parameters", "r"], {"physical": "upper"})
+    '“physical: upper” of r in the model as text'
     """
+    field, *parts = place or [""]
     labels = {
         name: f"{name} between samples" if field == "hold" else _LABELS.get(name, name)
         for name in entries
     }
-    return " and ".join(
+    chosen = " and ".join(
         f"“{labels[name]}: {TEXTS.get(value, value)}”" for name, value in entries.items()
     )
+    return f"{chosen} of {parts[0]} in the model as text" if parts else chosen
