@@ -41,12 +41,9 @@ def explain_afterwards(problem: Problem, result: Result) -> Result:
         analysis = analyse_estimate(problem, theta)
         explained = explain_residuals(ResidualContext(problem, theta, analysis))
         starts = compare_starts(problem, theta, problem.settings.initial)
-        doubts = find_hold_doubts(
-            problem, result.input_hold, problem.predict(theta[None])[0], result.rms
-        )
-        readings = find_other_readings(
-            problem, result.input_hold, doubts, result.parameters, result.rms, Simulations()
-        )
+        holds, simulated, tried = result.input_hold, problem.predict(theta[None])[0], Simulations()
+        doubts = find_hold_doubts(problem, holds, theta, simulated, result.rms, tried)
+        readings = find_other_readings(problem, holds, doubts, result.parameters, tried)
         advice = {one.brief: one.advice for one in readings}
     if not explained.is_done:
         return result

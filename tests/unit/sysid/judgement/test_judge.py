@@ -343,7 +343,7 @@ def propose_ramp(context: ResidualContext) -> Iterator[Candidate]:
 def use_proposers(
     monkeypatch: pytest.MonkeyPatch, *proposers: Callable[[ResidualContext], Iterator[Candidate]]
 ) -> None:
-    monkeypatch.setattr(judge, "_PROPOSERS", proposers)
+    monkeypatch.setattr(judge, "_CHEAP_PROPOSERS", proposers)
     monkeypatch.setattr(judge, "_FREE_PROPOSERS", ())
     monkeypatch.setattr(judge, "_COSTLY_PROPOSERS", ())
 
