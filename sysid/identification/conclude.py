@@ -195,7 +195,9 @@ def _build_identification(
     # Beside white residuals nothing is better, and in a loop the controller's inverse is.
     measures = compares_orders and not (is_white or is_of_the_solver or feedback)
     yardstick = fit_yardstick(problem, simulated) if measures else None
-    simulations = Simulations(budget.count_left(), deadline.is_past_grace)
+    # A sweep's run tries no setting: that is done when somebody opens it.
+    left = budget.count_left() if compares_orders else 0
+    simulations = Simulations(left, deadline.is_past_grace)
     explanations = (
         ()
         if feedback
