@@ -8,6 +8,7 @@ from sysid.core.text import join_names
 from sysid.core.units import format_unit
 from sysid.identifiability.combinations import IdentifiableCombination
 from sysid.judgement.levels import SEPARABLE
+from sysid.models.kalman_filter import is_noise_parameter
 from sysid.results.findings import Finding, note
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
@@ -20,8 +21,13 @@ _VAGUE_SHARE = 0.5  # of its value: standard error from which a group is practic
 def find_undetermined(
     problem: Problem, analysis: Analysis, delays: set[str], *, are_residuals_noise: bool
 ) -> Iterator[Finding]:
-    """Find what the data do not determine: alone, in combination, or beyond a bound."""
-    free, known = [one for one in analysis.estimates if one.is_free], analysis.uncertainty
+    """Find what the data do not determine: alone, in combination, or beyond a bound.
+
+    Sizes of noise that they leave open are a note: intervals of the others average over them.
+    """
+    free = [e for e in analysis.estimates if e.is_free and not is_noise_parameter(e.name)]
+    known = analysis.uncertainty
+    yield from _find_open_noise(analysis.estimates)
     yield from _find_bounds(analysis, free, delays, are_residuals_noise=are_residuals_noise)
     yield from _find_unidentifiable(free, () if known is None else known.groups)
     yield from _find_constant_inputs(problem, free)
@@ -29,6 +35,23 @@ def find_undetermined(
         yield from _find_insignificant(free, delays)
         yield from _find_vague_groups(known.groups)
         yield from _find_inseparable(known, free, delays)
+
+
+def _find_open_noise(estimates: Sequence[Estimate]) -> Iterator[Finding]:
+    open_sizes = [
+        one
+        for one in estimates
+        if is_noise_parameter(one.name) and one.is_free and one.status != "identified"
+    ]
+    if open_sizes:
+        names = join_names([one.name for one in open_sizes])
+        reasons = "; ".join(f"{one.name}: {one.reason or one.status}" for one in open_sizes)
+        yield note(
+            "size of noise",
+            "noise",
+            f"the data leave {names} open ({reasons}). Intervals of the other parameters allow "
+            "for it",
+        )
 
 
 def find_ambiguous(estimates: Sequence[Estimate]) -> Iterator[Finding]:
@@ -58,9 +81,9 @@ def _find_bounds(
 ) -> Iterator[Finding]:
     """Find estimates at a bound; with residuals that are not noise they are no physical limit."""
     bounded = [one for one in free if one.status == "at bound"]
-    if not bounded and not analysis.active_bounds:
+    active = [one for one in analysis.active_bounds if not is_noise_parameter(one.name)]
+    if not bounded and not active:
         return
-    active = analysis.active_bounds
     names = [bound.name for bound in active] or [one.name for one in bounded]
     lies = "lies at its bound" if len(names) == 1 else "lie at their bounds"
     texts = [str(bound) for bound in active]

@@ -256,8 +256,11 @@ class ResidualContext:
 
     @cached_property
     def parameter_numbers(self) -> list[tuple[int, str]]:
-        """Numbers and names of the free parameters that the model declares: no initial states."""
-        names = {parameter.name for parameter in self.problem.model.parameters}
+        """Numbers and names of the free parameters that the document declares.
+
+        So neither initial states nor the noise of a filter are among them.
+        """
+        names = {parameter.name for parameter in self.problem.given_model.parameters}
         return [(d, name) for d, name in enumerate(self.problem.free_names) if name in names]
 
     @cached_property

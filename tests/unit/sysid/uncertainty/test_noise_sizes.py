@@ -13,6 +13,7 @@ from sysid.uncertainty.intervals import Alternative, AverageOverNoise, compose_i
 from sysid.uncertainty.noise_sizes import NoisePoints, explore_noise_sizes
 
 PERIOD, SAMPLES = 0.5, 50
+LOAD = Loss(noise_model="load")
 LINE = {
     "name": "line",
     "form": "differential",
@@ -39,7 +40,7 @@ def build_line() -> tuple[Problem, FloatArray, FloatArray]:
     y = 1.5 * u - 0.7 + drift + 0.1 * random.normal(size=SAMPLES)
     record = Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
     columns = np.column_stack([u, np.ones(SAMPLES)])
-    return Problem.build(parse_model(LINE), [record]), columns, y
+    return Problem.build(parse_model(LINE), [record], loss=LOAD), columns, y
 
 
 def fit_dense(
