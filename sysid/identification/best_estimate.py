@@ -398,7 +398,8 @@ class _EstimateSearch:
         problem = self.problem
         if not self._may_choose_noise() or explained.criterion == -inf:
             return False
-        known = (self.theta, *(one.theta for one in (*self.ends, *self._fits)))
+        ends = [one.theta for one in self.ends]
+        known = (self.theta, *ends, *(one.theta for one in self._fits))
         most, late = self._budget.count_left(self._reserved), self._deadline.is_past_grace
         found = fit_filters(problem, known, most, late)
         if found is None:
