@@ -21,6 +21,7 @@ from sysid.judgement.residual_model import ColumnFit, ResidualModel
 from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.judgement.unrecorded_input import compute_reach
 from sysid.kernels.signals.past_reads import is_difference, list_delayed_values
+from sysid.models.kalman_filter import is_noise_parameter
 from sysid.models.model import MAX_SUBSTEPS, replace_substeps
 from sysid.models.ties import collect_parameter_names
 from sysid.residuals.series import ResidualPart, iterate_parts
@@ -219,10 +220,11 @@ class ResidualContext:
 
         Errors of the integration are taken out first. They are the program's, and no defect: an
         input that jumps inside a step leaves one, and under coloured noise even a small one shows.
-        A record that was simulated with the same steps has none: then they stay, by the criterion.
+        record that was simulated with the same steps has none: then they stay, by the criterion.
         """
         assert self.analysis.residuals_and_sensitivities is not None
         error, columns = self.analysis.residuals_and_sensitivities
+        columns = hold_noise(self.problem, columns)
         plain = ResidualModel(-error, columns, self.parts)
         if not self._integration_error.any():
             return plain
@@ -381,9 +383,8 @@ class ResidualContext:
             return None
         sensitivities = compute_sensitivities(problem, end.theta)
         self.simulations.spent += end.evaluations + sensitivities.evaluations
-        model = ResidualModel(
-            -sensitivities.residuals, sensitivities.columns, list(iterate_parts(problem))
-        )
+        columns = hold_noise(problem, sensitivities.columns)
+        model = ResidualModel(-sensitivities.residuals, columns, list(iterate_parts(problem)))
         fit, d = model.fit(dummies), start.size
         scale = compute_physical_scale(problem, end.theta)
         values = dict(
@@ -443,7 +444,8 @@ class ResidualContext:
             slopes = compute_sensitivities(self.problem, end.theta)
             self.simulations.spent += end.evaluations + slopes.evaluations
             residuals[is_part] = -slopes.residuals[is_part]
-            columns.append(np.where(is_part[:, None], slopes.columns, 0.0))
+            held = hold_noise(self.problem, slopes.columns)
+            columns.append(np.where(is_part[:, None], held, 0.0))
             points.append(end.theta)
         jumps = [self.shift_start(one, int(np.argmax(is_late))) for one in self.start_slopes]
         design = np.column_stack([*columns, *jumps])
@@ -716,6 +718,17 @@ class ResidualContext:
                     rows[part.rows] = True
             if rows.any():
                 yield output.name, rows, format_unit(output.unit)
+
+
+def hold_noise(problem: Problem, columns: FloatArray) -> FloatArray:
+    """Hold the sizes of noise in sensitivities (n, D): their columns become 0.
+
+    A size scales the innovations. So its column is nearly the residuals themselves where it is at a
+    bound, and a linear step along it would explain anything. The information of Gaussian noise has
+    no term between its mean and its sizes, so holding them costs nothing.
+    """
+    is_size = np.array([is_noise_parameter(name) for name in problem.free_names], dtype=bool)
+    return np.where(is_size, 0.0, columns)
 
 
 def read_channel(channel: Channel, times: FloatArray, lag: float = 0.0) -> FloatArray:

@@ -78,6 +78,12 @@ def test_a_load_is_chosen_by_its_likelihood_and_white_noise_is_not() -> None:
     assert identify("fopdt", make_record(0.0, 20.0), QUICK).noise_model == "white"
 
 
+def test_the_size_of_noise_is_bounded_as_any_parameter() -> None:
+    loss, narrow = Loss(noise_model="load"), {"load[u]": (0.01, 1.0)}
+    found = identify("fopdt", make_record(0.1, 20.0), QUICK, loss=loss, parameters=narrow)
+    assert found["load[u]"].status == "at bound"
+
+
 def test_first_order_noise_of_a_sensor_is_no_load() -> None:
     random, keep = np.random.default_rng(4), np.exp(-PERIOD / 3.0)
     clean = make_record(0.0, 20.0)

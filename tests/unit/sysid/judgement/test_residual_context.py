@@ -5,12 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sysid.core.settings import Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.judgement.judge import explain_residuals
 from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
+from sysid.search.refine import refine_candidates
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import analyse_estimate
 from tests.support.library.judged_records import (
     FAST,
     FINE,
@@ -301,3 +305,25 @@ def test_both_parts_of_a_record_are_fitted_by_themselves(before: float, after: f
     assert size > 20.0
     assert values == pytest.approx([before, after], abs=0.1)
     assert context.residual_model.without.criterion - found.criterion > 500.0
+
+
+def test_sizes_of_noise_explain_no_residuals() -> None:
+    u, random = draw_levels(3, N), np.random.default_rng(3)
+    drift = np.cumsum(0.02 * random.normal(size=N))
+    record = make_record(u, 2.0 * u + 1.0 + drift + NOISE * draw_noise(3))
+    settings = {"load[y]": {"lower": 0.01, "upper": 0.5}}  # too small: the size is at its bound
+    problem = Problem.build(
+        parse_model(LINE), [record], loss=Loss(noise_model="drift"), parameters=settings
+    )
+    start = dict(zip(problem.free_names, [2.0, 1.0, 0.5, 5.0], strict=True))
+    (end,) = refine_candidates(problem, [np.array([start[n] for n in problem.free_names])])
+    assert end is not None
+    context = ResidualContext(problem, end.theta, analyse_estimate(problem, end.theta))
+    lengths = np.linalg.norm(context.residual_model.columns, axis=0)
+    assert dict(zip(problem.free_names, lengths > 0.0, strict=True)) == {
+        "a": True,
+        "b": True,
+        "load[y]": False,
+        "tau[y]": False,
+    }
+    assert [name for _, name in context.parameter_numbers] == ["a", "b"]
