@@ -65,13 +65,14 @@ class System:
     @cached_property
     def clean(self) -> FloatArray:
         """The output without noise."""
-        first = np.full(self.samples, self.start.get("y", 0.0))
+        first = np.full(self.samples, self.start.get("x", 0.0))
         problem = self._build_problem(self._build_record(first))
         return problem.predict(self.place(problem)[None])[0]
 
     def place(self, problem: Problem) -> FloatArray:
         """The true values in the order of the free parameters."""
-        return np.array([self.truth[name] for name in problem.free_names])
+        values = {f"{state}(0)": value for state, value in self.start.items()} | dict(self.truth)
+        return np.array([values[name] for name in problem.free_names])
 
     def record(self, seed: int) -> Record:
         """The system's record with the noise of that seed."""
@@ -160,7 +161,7 @@ OTHERS = (
         0.05,
         {"mu": 1.0, "w": 1.5, "g": 0.8, "L": 1.7, "v(0)": 0.0},
         switching(2.0, 20, 1),
-        start={"y": 0.5},
+        start={"x": 0.5},
     ),
     System(
         "Mackey-Glass",
@@ -168,7 +169,7 @@ OTHERS = (
         150,
         1.0,
         {"beta": 0.2, "gamma": 0.1, "n": 10.0, "L": 17.0},
-        start={"y": 1.2},
+        start={"x": 1.2},
     ),
     System(
         "delayed logistic",
@@ -176,7 +177,7 @@ OTHERS = (
         400,
         0.05,
         {"r": 1.8, "K": 10.0, "L": 1.0},
-        start={"y": 2.0},
+        start={"x": 2.0},
     ),
     System(
         "FOPDT, lag to half the record",

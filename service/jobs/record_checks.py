@@ -11,6 +11,7 @@ from service.core.errors import FieldError, to_field_errors
 from service.datasets.signal_channels import map_channels
 from service.jobs.to_core import read_algorithm, read_fit
 from sysid.core.errors import RecordTooShort, SysidError, suggest_name
+from sysid.data.holds import MEANS
 from sysid.data.records import find_shared_channels
 from sysid.language.delays import has_varying_delay
 from sysid.models.channel_assignment import check_holds
@@ -19,7 +20,7 @@ from sysid.models.model_delays import check_record_length, compute_longest_delay
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.sections import get_interval
 from sysid.models.unit_checks import SignalUnits
-from sysid.simulation.output_means import MEANS, check_mean_output
+from sysid.simulation.output_means import check_mean_output
 
 if TYPE_CHECKING:
     from service.storage.tables import Dataset

@@ -17,7 +17,9 @@ from sysid.core.types import FloatArray
 Hold = Literal["zero", "first", "band-limited", "mean", "mean-after"]
 HoldSetting = Literal["auto", "zero", "first", "band-limited", "mean", "mean-after"]
 HOLDS: tuple[HoldSetting, ...] = get_args(HoldSetting)
-OUTPUT_HOLDS: tuple[HoldSetting, ...] = ("auto", "mean", "mean-after")
+MEANS: tuple[Hold, ...] = ("mean", "mean-after")
+"""Holds of a value that is the mean of a period."""
+OUTPUT_HOLDS: tuple[HoldSetting, ...] = ("auto", *MEANS)
 """Those of an output; ``auto`` is a value at its stamp."""
 HOLD_TEXTS: Mapping[HoldSetting, str] = {
     "auto": "decided from the data",

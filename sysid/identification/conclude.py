@@ -196,13 +196,15 @@ def _build_identification(
         metrics.rms,
         run_residual_tests(problem, simulated, "estimation") if any(times.values()) else tests,
     )
+    is_of_the_solver = (
+        explained.is_of_the_solver or metrics.rms <= SOLVER_SHARE * problem.output_scale
+    )
     is_white = analysis.uncertainty is None or analysis.uncertainty.noise_colour == "white"
     # Beside white residuals nothing is better, and in a loop the controller's inverse is.
-    measures = compares_orders and not is_white and not feedback
+    measures = compares_orders and not (is_white or is_of_the_solver or feedback)
     yardstick = fit_yardstick(problem, simulated) if measures else None
     if compares_orders and not problem.is_free_run:
         yardstick = _measure_free_run(problem, theta)
-    is_of_the_solver = metrics.rms <= SOLVER_SHARE * problem.output_scale
     simulations = Simulations(budget.count_left(), deadline.is_past_grace)
     explanations = (
         ()

@@ -19,10 +19,8 @@ from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit
 
 _BUDGET_SHARE = 4  # all starts take at most one in so many simulations of a budget
-_DRAWN, _REFINED = (
-    256,
-    16,
-)  # random points, and groups of them, of each of which the best is refined
+_DRAWN = 256  # random points
+_REFINED = 16  # groups of them, of each of which the best is refined
 
 
 def find_free_run_starts(problem: Problem, algorithm: GeneticAlgorithm, seed: int) -> SearchStarts:

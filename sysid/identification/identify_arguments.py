@@ -16,7 +16,7 @@ from sysid.data.foreign_tables import (
     is_labelled,
     read_columns,
 )
-from sysid.data.holds import HoldSetting
+from sysid.data.holds import MEANS, HoldSetting
 from sysid.data.records import Channel, Record, Recording, to_channel
 from sysid.data.value_checks import find_infinite_value
 from sysid.models.channel_assignment import (
@@ -80,7 +80,7 @@ def read_records(
 
 def _check_means(record: Record, holds: Mapping[str, HoldSetting]) -> None:
     for channel in (*record.inputs, *record.outputs):
-        if "mean" in holds.get(channel.name, ""):
+        if holds.get(channel.name) in MEANS:
             try:
                 channel.read_period()
             except InvalidRecord as error:

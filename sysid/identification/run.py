@@ -51,9 +51,8 @@ def begin_run(
     """Create a run before its first generation; `warm` values seed a quarter of the population.
 
     The improved search of a polynomial is also seeded by one-step least squares, and that of a
-    filter by free runs. Values of all
-    free parameters count as an earlier result, after which a run settles sooner. Values of only
-    some parameters just seed the search.
+    filter by free runs. Values of all free parameters count as an earlier result, after which a run
+    settles sooner. Values of only some parameters just seed the search.
     """
     warm_starts = (warm,) if isinstance(warm, Mapping) else tuple(warm or ())
     warm_starts = tuple(values for values in warm_starts if values)

@@ -15,7 +15,9 @@ from sysid.results.findings import Finding, Severity
 from sysid.simulation.fit_metrics import ChannelMetrics, Metrics
 from sysid.simulation.problem import Problem
 
-_LITTLE = 30.0  # %: a smaller fit beside residuals that are not noise is a failure
+_LITTLE = 30.0
+"""%: a smaller fit beside residuals that are not noise is a failure. Measured with
+`benchmarks.judgement`, a record of each of 102 kinds: 20 or 40 change the statuses of one each."""
 _SHARE_OF_DEGREES = 0.25  # of the samples: degrees of freedom of a variance, if the pole is 0.77
 
 

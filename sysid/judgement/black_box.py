@@ -27,7 +27,9 @@ from sysid.residuals.autocorrelation import ROUNDING_SHARE, pad_length
 
 _MOST_POLES = 4  # for each input
 _LEAST_SHARE = 0.5  # of the samples must be told
-_ROWS_PER_PARAMETER = 5
+_ROWS_PER_PARAMETER = 5  # at least
+"""Measured with `benchmarks.judgement`, a record of each of 102 kinds: 3 to 10, with a
+`_MOST_DAMPING` of 0.9 to 0.995, give the same verdicts. One tells 96 % instead of 97 %."""
 _MOST_POINTS = 20_000  # of a grid: a longer record is averaged
 _LONGEST_DELAY = 1.0 / 3.0  # of the record
 _SLOW = 3.0  # over the record: only one section may have a slower pole
@@ -35,12 +37,14 @@ _SLOWEST = 0.01  # over the record: an integrator
 _FASTEST = 3.0  # per step: a faster pole is a static gain
 _SPACING = 0.6  # of the logarithm of a rate
 _DAMPING = (0.1, 0.5)
-_MOST_DAMPING = 0.98
+_MOST_DAMPING = 0.98  # of a pair: beyond it, two real poles do as well
 _STEPS = 8  # of Gauss–Newton, for each new section
 _CONVERGED = 1e-3  # relative decrease of the squares
 _DIFFERENCE = 1e-3  # of a step or a logarithm, for slopes by differences
 _MOST_MOVE = (3.0, 1.0, 1.0)  # of a delay in steps, and of logarithms
 _RIDGE = 1e-9  # of the square of a column, against rounding
+"""Measured with `benchmarks.judgement`, a record of each of 102 kinds: `_MOST_POLES` of 3 or 6,
+`_LEAST_SHARE` of 0.3 or 0.7 and `_SPACING` of 0.9 or 0.4 leave all statuses."""
 
 
 class Samples(NamedTuple):

@@ -16,7 +16,7 @@ from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 from sysid.data.records import Channel, Record
 from sysid.judgement.judge import leaves_noise
-from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE
+from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE, STRONG_ODDS
 from sysid.judgement.residual_context import Simulations
 from sysid.kernels.signals.past_reads import is_difference
 from sysid.residuals.feedback import find_commands
@@ -149,11 +149,16 @@ def find_other_readings(
         if doubt or (notable and hold.chosen == "zero"):
             other = f"{_READINGS[str(hold.other)]} ({write_hold(hold)})"
             would = _describe_moves(notable, estimates) or "the same estimates"
-            outside = [one.parameter for one in notable if known[one.parameter].excludes(one.value)]
+            is_likelier = evidence > STRONG_ODDS
+            moved = [
+                one.parameter
+                for one in notable
+                if is_likelier or known[one.parameter].excludes(one.value)
+            ]
             yield Finding(
                 "reading of an input",
                 "reading",
-                "caution" if doubt and outside else "note",
+                "caution" if doubt and moved else "note",
                 f"{hold.input} may be read {_READINGS[str(hold.other)]}",
                 f"input {hold.input!r} {hold.reason}, so it is read {_READINGS[hold.chosen]}. Read "
                 f"{other} it would give {would}.{f' {doubt}.' if doubt else ''}",
@@ -162,7 +167,7 @@ def find_other_readings(
                 else "",
                 evidence,
                 moves,
-                tuple(outside) if doubt else (),
+                tuple(moved) if doubt else (),
             )
         if hold.chosen == "zero" and hold.other is not None:
             yield from _find_uncertain_jumps(hold.input, problem.records)

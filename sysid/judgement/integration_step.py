@@ -37,7 +37,7 @@ from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.intervals import IntegrationError, compose_interval
 from sysid.uncertainty.sensitivities import BudgetSpentError, compute_sensitivities
 
-_FACTOR = 2
+_FACTOR = 2  # times as many steps: they are halved
 _NOTABLE_MOVE = 0.3  # of a standard error
 _NOTABLE_GROWTH = 1.3  # of a standard error with half the step
 _NOTABLE_ERROR = 1e-3  # of the output's size: smaller integration errors act linearly

@@ -25,6 +25,7 @@ from sysid.judgement.explanations.noise import (
     find_disagreement_of_frequencies,
     find_noise,
 )
+from sysid.judgement.full_fits import refit, refit_experiments, refit_parts
 from sysid.judgement.levels import (
     ADDED_SHARE,
     BENT_SHARE,
@@ -86,6 +87,8 @@ class Explained(NamedTuple):
     is_doubtful : bool
         Whether something has strong odds against noise alone, but not those of a defect. Or not all
         were looked for.
+    is_of_the_solver : bool
+        Whether the residuals are errors of the integration.
     criterion : float
         Schwarz's criterion of coloured noise alone; minus infinity if it was not computed.
     odds : float
@@ -96,6 +99,7 @@ class Explained(NamedTuple):
     findings: tuple[Finding, ...] = ()
     is_done: bool = False
     is_doubtful: bool = False
+    is_of_the_solver: bool = False
     criterion: float = -inf
     odds: float = 0.0
 
@@ -121,6 +125,8 @@ def explain_residuals(context: ResidualContext) -> Explained:
     """
     if not _is_possible(context):
         return Explained(is_doubtful=context.simulations.is_cut_short)
+    if context.is_of_the_solver:
+        return Explained(is_done=True, is_doubtful=True, is_of_the_solver=True)
     return _explain(context, _score_at_once(context), advises=True)
 
 
@@ -144,7 +150,7 @@ def explain_if_noise(context: ResidualContext) -> Explained:
 def _score_at_once(context: ResidualContext) -> list[_Scored]:
     """Score the explanations that take few simulations or none."""
     criterion = context.residual_model.without.criterion
-    return _score(context, list(_list_candidates(context, _PROPOSERS)), [], 0, criterion)
+    return _score(context, list(_list_candidates(context, _PROPOSERS)), criterion)
 
 
 def _explain(context: ResidualContext, scored: list[_Scored], *, advises: bool) -> Explained:
@@ -154,7 +160,7 @@ def _explain(context: ResidualContext, scored: list[_Scored], *, advises: bool) 
     taken, counted = list[FloatArray](), 0
     if base.is_coloured or any(_is_likely(one, context.times.size) for one in scored):
         costly = list(_list_candidates(context, _COSTLY_PROPOSERS))
-        scored += _score(context, costly, taken, counted, base.criterion)
+        scored += _score(context, costly, base.criterion)
         scored = _refit_finalists(context, _order(scored), base.criterion)
     criterion, odds = base.criterion, 0.0
     is_doubtful = bool(scored) and STRONG_ODDS < scored[0].gain <= DEFECT_GAIN
@@ -187,7 +193,7 @@ def _explain(context: ResidualContext, scored: list[_Scored], *, advises: bool) 
         )
         scored = [
             one._replace(gain=min(one.gain, best.gain))
-            for one in _score(context, candidates, taken, counted, base.criterion)
+            for one in _score(context, candidates, base.criterion, taken, counted)
         ]
     findings += find_noise(context, base)
     if not findings:
@@ -195,7 +201,7 @@ def _explain(context: ResidualContext, scored: list[_Scored], *, advises: bool) 
     is_cut_short = context.simulations.is_cut_short
     is_doubtful |= is_cut_short
     odds += criterion - base.criterion
-    return Explained(tuple(findings), not is_cut_short, is_doubtful, criterion, odds)
+    return Explained(tuple(findings), not is_cut_short, is_doubtful, criterion=criterion, odds=odds)
 
 
 def _propose_beside(beside: ResidualContext, others: Sequence[Candidate]) -> list[Candidate]:
@@ -250,11 +256,14 @@ def _have_lengths(columns: FloatArray) -> bool:
 def _score(
     context: ResidualContext,
     candidates: Sequence[Candidate],
-    taken: Sequence[FloatArray],
-    counted: int,
     criterion: float,
+    taken: Sequence[FloatArray] = (),
+    counted: int = 0,
 ) -> list[_Scored]:
-    """Score candidates beside the columns (n, t) that are taken, the largest gain first."""
+    """Score candidates against a criterion, the largest gain first.
+
+    They are beside the columns (n, t) that are `taken`, of so many parameters more (`counted`).
+    """
     fits = context.residual_model.fit_each(
         [one.columns for one in candidates], [counted + one.counted for one in candidates], taken
     )
@@ -301,7 +310,7 @@ def _refit_finalists(
         if name in tried or not one.candidate.is_refitted:
             continue
         tried[name] = position
-        found = context.refit(one.candidate.change)
+        found = refit(context, one.candidate.change)
         if found is None:
             continue
         added = one.candidate.columns.shape[1] + one.candidate.counted
@@ -321,10 +330,11 @@ def _refit_moments(
     if not scored or scored[0].gain <= 0.0:
         return []
     refitted, moments = list[_Scored](), list(context.gap_ends)
-    likeliest = next((one for one in scored if one.candidate.moment is not None), None)
-    if likeliest is not None and likeliest.gain > 0.0:
-        moments.append(likeliest.candidate.moment or 0.0)
-        refitted += _part_finalist(context, likeliest, criterion)
+    changes = ((one, one.candidate.moment) for one in scored)
+    likeliest, change = next((pair for pair in changes if pair[1] is not None), (scored[0], None))
+    if change is not None and likeliest.gain > 0.0:
+        moments.append(change)
+        refitted += _part_finalist(context, likeliest, change, criterion)
     for moment in dict.fromkeys(moments):
         refitted += _divide_finalist(context, scored[0], moment, criterion)
     return refitted
@@ -334,7 +344,7 @@ def _divide_finalist(
     context: ResidualContext, likeliest: _Scored, moment: float, criterion: float
 ) -> list[_Scored]:
     """Let another experiment begin at a moment (s), which counts as a parameter."""
-    found = context.refit_experiments(moment)
+    found = refit_experiments(context, moment)
     if found is None:
         return []
     gain = float(criterion - found.criterion - np.log(max(context.times.size, 2)))
@@ -353,10 +363,11 @@ def _divide_finalist(
     return [_Scored(candidate, likeliest.fit, gain, found.moves)]
 
 
-def _part_finalist(context: ResidualContext, likeliest: _Scored, criterion: float) -> list[_Scored]:
-    """Fit both sides of the likeliest moment of a change by themselves."""
-    moment = likeliest.candidate.moment or 0.0
-    found = context.refit_parts(moment)
+def _part_finalist(
+    context: ResidualContext, likeliest: _Scored, moment: float, criterion: float
+) -> list[_Scored]:
+    """Fit both sides of the moment (s) of the likeliest change by themselves."""
+    found = refit_parts(context, moment)
     if found is None:
         return []
     gain = criterion - found.criterion
@@ -497,7 +508,7 @@ def select_explanations(
     of_noise = [one for one in explained if one.is_of_noise]
     first = max((one.gain or 0.0 for one in explained if not one.is_of_noise), default=0.0)
     other = max((one.gain or 0.0 for one in refitted), default=0.0)
-    kept = [one for one in refitted if one.gain is None or (one.gain or 0.0) > first - STRONG_ODDS]
+    kept = [one for one in refitted if one.gain is None or one.gain > first - STRONG_ODDS]
     if other - first > STRONG_ODDS:
         return (*of_noise, *_leave_out_rival_settings(kept))
     return _leave_out_rival_settings([*explained, *kept])

@@ -45,8 +45,8 @@ from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.sensitivities import compute_sensitivities
 
 MIN_GROWTH = 10.0
-"""Of the effect of a start, from which on a free run counts as unstable."""
-_MOST_SIMULATIONS = 3000
+"""Of the effect of a start, from which on a run is unstable: a double integrator reaches three."""
+_MOST_SIMULATIONS = 3000  # of the fit to predictions: with fewer left, none is made
 
 
 class OneStepComparison(NamedTuple):

@@ -28,6 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from sysid.core.robust import estimate_deviation
 from sysid.core.types import BoolArray, FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.model import Model
@@ -365,5 +366,4 @@ def _estimate_noise(values: FloatArray) -> float:
     """
     if values.size < _REST_SAMPLES:
         return 0.0
-    bend = np.diff(values, 2)
-    return 1.4826 * float(np.median(np.abs(bend))) / sqrt(6.0)
+    return estimate_deviation(np.diff(values, 2)) / sqrt(6.0)

@@ -6,7 +6,7 @@ parameter. Statuses, verdict and warnings follow from the findings in one place,
 `sysid.judgement.conclusions`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -146,6 +146,11 @@ def list_moves(
         for one in estimates
         if (name := one.name) in values and name in own and one.stderr
     ]
+    return order_moves(moves)
+
+
+def order_moves(moves: Iterable[Move]) -> tuple[Move, ...]:
+    """Order moves, the furthest first."""
     return tuple(sorted(moves, key=lambda move: -abs(move.stderrs)))
 
 

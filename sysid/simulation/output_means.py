@@ -9,13 +9,12 @@ from dataclasses import replace
 
 from sysid.core.errors import InvalidRecord, InvalidSettings, join_pointer
 from sysid.core.settings import PredictionKind
+from sysid.data.holds import MEANS
 from sysid.data.records import Channel, Record
 from sysid.kernels.signals.past_reads import is_difference
 from sysid.language.tree import Binary, Number, PastValue
 from sysid.models.model import FixedInitial, Model, ModelSignal
 
-MEANS = ("mean", "mean-after")
-"""Holds of an output that is a mean."""
 _PERIOD_TOLERANCE = 1e-3  # relative difference of the periods of two records
 
 

@@ -61,6 +61,7 @@ from sysid.simulation.output_means import average_outputs
 
 _Value = TypeVar("_Value")
 _ReduceResult = tuple[Callable[..., "Problem"], tuple[Any, ...]]
+_WriteValues = Callable[[GridExperiment, IntArray, FloatArray], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,15 +301,7 @@ class Problem:
                 strict=True,
             )
         )
-        evaluator = (
-            _replace_measured(
-                self.evaluator, self.averaged_model, experiments, self._has_grid_samples
-            )
-            if are_alike
-            else _build_evaluator(
-                self.averaged_model, experiments, self.all_parameters, self.settings
-            )
-        )
+        evaluator = self._fill_evaluator(experiments, are_alike, self._write_outputs)
         return replace(
             self,
             records=tuple(records),
@@ -332,19 +325,40 @@ class Problem:
             for before, after in zip(self.experiments, experiments, strict=True)
             for new, old in zip(after.inputs, before.inputs, strict=True)
         )
-        evaluator = (
-            _replace_input_values(self.evaluator, self.averaged_model, experiments)
-            if are_alike
-            else _build_evaluator(
-                self.averaged_model, experiments, self.all_parameters, self.settings
-            )
-        )
+        evaluator = self._fill_evaluator(experiments, are_alike, self._write_inputs)
         return replace(
             self,
             records=tuple(records),
             evaluator=evaluator,
             experiments=experiments,
             _shared={},  # may depend on inputs
+        )
+
+    def _fill_evaluator(
+        self, experiments: Sequence[GridExperiment], are_alike: bool, write: _WriteValues
+    ) -> Evaluator:
+        """Write experiments into the evaluator; it is built again if they are of another form."""
+        if are_alike:
+            return _replace_values(self.evaluator, experiments, write)
+        return _build_evaluator(
+            self.averaged_model, experiments, self.all_parameters, self.settings
+        )
+
+    def _write_inputs(self, experiment: GridExperiment, ints: IntArray, floats: FloatArray) -> None:
+        replace_input_values(
+            self.averaged_model, ints, floats, experiment.inputs, experiment.first_inputs
+        )
+
+    def _write_outputs(
+        self, experiment: GridExperiment, ints: IntArray, floats: FloatArray
+    ) -> None:
+        replace_measured(
+            self.averaged_model,
+            ints,
+            floats,
+            experiment.outputs,
+            experiment.starts,
+            on_grid=self._has_grid_samples,
         )
 
     @cached_property
@@ -613,43 +627,15 @@ def _build_evaluator(
     )
 
 
-def _replace_input_values(
-    evaluator: Evaluator, model: Model, experiments: Sequence[GridExperiment]
+def _replace_values(
+    evaluator: Evaluator, experiments: Sequence[GridExperiment], write: _WriteValues
 ) -> Evaluator:
-    """Replace the inputs of an evaluator by others of as many values."""
+    """Replace values of an evaluator by those that are written of experiments of the same form."""
     floats = evaluator.floats.copy()
     for experiment, (first_int, first_float, _) in zip(
         experiments, evaluator.offsets.tolist(), strict=True
     ):
-        replace_input_values(
-            model,
-            evaluator.ints[first_int:],
-            floats[first_float:],
-            experiment.inputs,
-            experiment.first_inputs,
-        )
-    return evaluator._replace(floats=floats)
-
-
-def _replace_measured(
-    evaluator: Evaluator,
-    model: Model,
-    experiments: Sequence[GridExperiment],
-    on_grid: bool,
-) -> Evaluator:
-    """Replace the measured values of an evaluator; places and weights are as before."""
-    floats = evaluator.floats.copy()
-    for experiment, (first_int, first_float, _) in zip(
-        experiments, evaluator.offsets.tolist(), strict=True
-    ):
-        replace_measured(
-            model,
-            evaluator.ints[first_int:],
-            floats[first_float:],
-            experiment.outputs,
-            experiment.starts,
-            on_grid=on_grid,
-        )
+        write(experiment, evaluator.ints[first_int:], floats[first_float:])
     measured = np.concatenate([s.values for e in experiments for s in e.outputs])
     return evaluator._replace(floats=floats, measured=measured)
 

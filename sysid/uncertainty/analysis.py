@@ -30,6 +30,7 @@ import numpy as np
 
 from sysid.core.distributions import student_limit
 from sysid.core.linear_algebra import TruncatedSvd, compute_truncated_svd
+from sysid.core.robust import estimate_deviation
 from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 from sysid.identifiability.active_bounds import ActiveBound, is_active, rank_active_bounds
 from sysid.identifiability.bound_limits import list_widest_bounds
@@ -391,8 +392,7 @@ def _estimate_covariance(
         (columns.T * share**3) @ columns, rcond=RANK_TOLERANCE**2, hermitian=True
     )
     filling = (columns.T * influence**2) @ columns if colour is None else colour.middle
-    noise = 1.4826 * float(np.median(np.abs(error)))  # of the bulk, not of the outliers
-    return widening * bread @ filling @ bread, noise, widening * filling
+    return widening * bread @ filling @ bread, estimate_deviation(error), widening * filling
 
 
 def _compute_degrees_of_freedom(

@@ -184,13 +184,13 @@ def test_cancel_and_finish_at_once_end_in_one_state_and_one_end_event(database):
 
 def test_a_resumed_job_runs_again_only_what_did_not_succeed(database):
     got, (done, bad, _) = submit_and_claim(database, n_runs=3)
+    record_outcomes(
+        database,
+        got.lease,
+        RunOutcome(run_id=done, state=JobState.SUCCEEDED, best_rms=0.1),
+        RunOutcome(run_id=bad, state=JobState.FAILED, error="diverged"),
+    )
     with database.write_session() as session:
-        RunWriter(session, got.lease).record_outcomes(
-            [
-                RunOutcome(run_id=done, state=JobState.SUCCEEDED, best_rms=0.1),
-                RunOutcome(run_id=bad, state=JobState.FAILED, error="diverged"),
-            ]
-        )
         LeaseQueue(session).finish_job(got.lease, JobState.FAILED, "1 run failed")
     with database.write_session() as session:
         JobRepository(session).get(got.job.id).fit_estimation = 90.0
@@ -240,14 +240,13 @@ def test_only_a_failed_or_cancelled_job_can_be_resumed(database):
 
 def test_the_failed_runs_of_a_job_that_ended_are_resumed_alone(database):
     got, (done, bad, late) = submit_and_claim(database, n_runs=3)
-    with database.write_session() as session:
-        RunWriter(session, got.lease).record_outcomes(
-            [
-                RunOutcome(run_id=done, state=JobState.SUCCEEDED, best_rms=0.1),
-                RunOutcome(run_id=bad, state=JobState.FAILED, error="the store was away"),
-                RunOutcome(run_id=late, state=JobState.SUCCEEDED, best_rms=0.2),
-            ]
-        )
+    record_outcomes(
+        database,
+        got.lease,
+        RunOutcome(run_id=done, state=JobState.SUCCEEDED, best_rms=0.1),
+        RunOutcome(run_id=bad, state=JobState.FAILED, error="the store was away"),
+        RunOutcome(run_id=late, state=JobState.SUCCEEDED, best_rms=0.2),
+    )
     with pytest.raises(RowConflict, match="by itself"), database.write_session() as session:
         JobRepository(session).resume(got.job.id, only_failed=True)
     with database.write_session() as session:

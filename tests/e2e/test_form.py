@@ -78,6 +78,30 @@ def test_own_equations_are_submitted_with_bounds_and_channels(own_site: Site, pa
     assert spec["algorithm"]["population"] == 24
 
 
+@pytest.mark.parametrize("hold", ["mean", "mean-after"])
+def test_an_output_that_is_a_mean_is_one_in_the_job_and_in_its_clone(
+    own_site: Site, page: Page, hold: str
+) -> None:
+    open_form(own_site, page, f"?dataset={own_site.filled.dataset}")
+    write_own(page, EQUATIONS)
+    expect(page.locator("#check")).to_contain_text("the model is valid")
+    page.get_by_label("output y").select_option("P2")
+    choice = page.get_by_label("y between samples")
+    expect(choice).to_have_value("")  # as recorded
+    values = choice.locator("option").evaluate_all("all => all.map(one => one.value)")
+    assert values == ["", "mean", "mean-after"]  # no other hold is one of an output
+    choice.select_option(hold)
+    page.get_by_role("button", name="Identify").click()
+    page.wait_for_url(re.compile(r"/jobs/job_"))
+    page.get_by_text("The exact request").click()
+    expect(page.locator(".request pre")).to_contain_text(re.compile(rf'"y": "{hold}"'))
+    job = page.url.rsplit("/", 1)[1]
+    with own_site.parts.database.read_session() as session:
+        assert JobRepository(session).get(job).spec["hold"] == {"y": hold}
+    open_form(own_site, page, f"?clone={job}")
+    expect(choice).to_have_value(hold)
+
+
 def test_a_refused_request_is_told_at_the_field(site: Site, page: Page) -> None:
     open_form(site, page, f"?dataset={site.filled.dataset}")
     write_own(page, EQUATIONS)  # of the recording's units: nothing else is refused

@@ -12,7 +12,7 @@ from sysid.core.settings import (
     GeneticAlgorithm,
     Loss,
 )
-from sysid.data.holds import HOLDS, OUTPUT_HOLDS
+from sysid.data.holds import HOLDS, MEANS
 
 NAMES: Mapping[str, Sequence[str]] = {
     "method": SEARCH_METHODS,
@@ -20,7 +20,7 @@ NAMES: Mapping[str, Sequence[str]] = {
     "noise_model": NOISE_MODELS,
     "prediction": PREDICTION_KINDS,
     "hold": HOLDS,
-    "output_hold": OUTPUT_HOLDS[1:],
+    "output_hold": MEANS,
     "initial": INITIAL_SETTINGS,
 }
 """Names to choose from, by the field of the form."""

@@ -9,11 +9,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from sysid.core.robust import estimate_deviation
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
 from sysid.judgement.residual_context import (
@@ -47,8 +49,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
     for channel in context.moving_inputs:
         name = channel.name
         low, high = float(np.min(channel.values)), float(np.max(channel.values))
-        span = high - low
-        changes = list(_list_changes(name, low, high, span))
+        changes = list(_list_changes(name, low, high))
         if channel.effective_hold != "zero":  # a command that is held has no noise
             changes += _list_smoothings(name)
         for change in changes:
@@ -123,20 +124,22 @@ def _add_step(record: Record, name: str, begin: float, size: float) -> Record:
     return replace(record, inputs=tuple(inputs))
 
 
-def _list_changes(name: str, low: float, high: float, span: float) -> Iterator[_Change]:
-    """List changes of an input (N,), with their words."""
+def _list_changes(name: str, low: float, high: float) -> Iterator[_Change]:
+    """List changes of an input whose values lie between two, with their words."""
+    middle, span = 0.5 * (low + high), high - low
     for share in _LIMITS:
-        limit, brief = "limit of an actuator", f"{name} has a limit"
-        text = (
-            f"what acts on the plant stays {{}} about {{:.4g}}, while {name} goes further: an "
-            "actuator at its limit"
-        )
-        top, bottom = low + share * span, high - share * span
-        clip_high = partial(np.minimum, top)
-        yield _Change(clip_high, limit, "actuator", brief, text.format("below", top))
-        clip_low = partial(np.maximum, bottom)
-        yield _Change(clip_low, limit, "actuator", brief, text.format("above", bottom))
-    middle = 0.5 * (low + high)
+        for clip, level, word in (
+            (np.minimum, low + share * span, "below"),
+            (np.maximum, high - share * span, "above"),
+        ):
+            yield _Change(
+                partial(clip, level),
+                "limit of an actuator",
+                "actuator",
+                f"{name} has a limit",
+                f"what acts on the plant stays {word} about {level:.4g}, while {name} goes "
+                "further: an actuator at its limit",
+            )
     for power, word in ((2, "the square"), (3, "the cube")):
         yield _Change(
             partial(_bend, middle=middle, span=span, power=power),
@@ -159,7 +162,7 @@ def _list_changes(name: str, low: float, high: float, span: float) -> Iterator[_
             "dead zone",
             "actuator",
             f"{name} has a dead zone",
-            f"Small values of {name} do not act on the plant",
+            f"small values of {name} do not act on the plant",
         )
     for share in _RATES:
         yield _Change(
@@ -193,11 +196,16 @@ def _list_smoothings(name: str) -> Iterator[_Change]:
         )
 
 
+def _measure_noise(values: FloatArray) -> float:
+    """Measure the deviation of white noise by the differences of neighbours."""
+    return estimate_deviation(np.diff(values)) / sqrt(2.0)
+
+
 def _round_to_levels(values: FloatArray) -> FloatArray:
     """Round values to the means of their clusters, between which nothing lies (single linkage)."""
     order = np.argsort(values, kind="stable")
     gaps = np.diff(values[order])
-    deviation = 1.4826 * float(np.median(np.abs(np.diff(values)))) / np.sqrt(2.0)
+    deviation = _measure_noise(values)
     numbers = np.concatenate([[0], np.cumsum(gaps > deviation)])
     means = np.bincount(numbers, values[order]) / np.bincount(numbers)
     rounded = np.empty(values.size)
@@ -255,7 +263,7 @@ def _keep_edges(values: FloatArray, width: int) -> FloatArray:
 
     Little is a few deviations of the differences between neighbours.
     """
-    deviation = 1.4826 * float(np.median(np.abs(np.diff(values)))) / np.sqrt(2.0)
+    deviation = _measure_noise(values)
     if not deviation > 0:  # levels that are held have no noise
         return values
     padded = np.pad(values, width // 2, mode="edge")

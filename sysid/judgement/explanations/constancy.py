@@ -19,78 +19,88 @@ _SAME_COLUMN = 0.99  # correlation: a lag and a clock that move the output alike
 
 def propose(context: ResidualContext) -> Iterator[Candidate]:
     """Propose that a parameter, or the offset of the clocks, changes or drifts."""
-    model = context.residual_model
-    scale = compute_physical_scale(context.problem, context.theta)
-    share = _centre_times(context)
     clock = context.weigh(context.slope)[:, 0]
     offsets = [context.weight * rows for _, rows, _ in context.iterate_outputs()]
     is_lag_a_clock = False
     for number, name in context.parameter_numbers:
-        column = model.columns[:, number]
+        column = context.residual_model.columns[:, number]
         if not column.any() or any(_are_alike(column, offset) for offset in offsets):
             continue  # an offset of an output: a step or a drift of its sensor
-        is_lag = name in context.delays
-        is_clock = is_lag and _are_alike(column, clock)
+        is_clock = name in context.delays and _are_alike(column, clock)
         is_lag_a_clock |= is_clock
-        subject = f"{name}, or the offset between the clocks," if is_clock else name
-        explanation = "change of a time lag" if is_lag else "change of a parameter"
-        for at, late, moment in context.find_breaks(column):
-            yield Candidate(
-                explanation,
-                "constancy",
-                late[:, None],
-                f"{name} changes at about {moment}",
-                f"{subject} changes at about {moment}",
-                CUT_THERE,
-                counted=1,
-                describe=_describe_change(context, number, float(scale[number])),
-                varies=(number, 0.0, 1.0),
-                moment=at,
-            )
+        yield from _propose_changes(context, number, name, is_clock=is_clock)
+    if not is_lag_a_clock and context.problem.is_free_run:
+        yield from _propose_clocks(context, clock)
+
+
+def _propose_changes(
+    context: ResidualContext, number: int, name: str, *, is_clock: bool
+) -> Iterator[Candidate]:
+    """Propose that a parameter changes, drifts, or follows a signal."""
+    column = context.residual_model.columns[:, number]
+    scale = float(compute_physical_scale(context.problem, context.theta)[number])
+    kind = "a time lag" if name in context.delays else "a parameter"
+    subject = f"{name}, or the offset between the clocks," if is_clock else name
+    for at, late, moment in context.find_breaks(column):
         yield Candidate(
-            "drift of a time lag" if is_lag else "drift of a parameter",
+            f"change of {kind}",
             "constancy",
-            (column * share)[:, None],
-            f"{name} drifts",
-            f"{subject} drifts over the record",
-            describe=_describe_drift(context, number, float(scale[number])),
+            late[:, None],
+            f"{name} changes at about {moment}",
+            f"{subject} changes at about {moment}",
+            CUT_THERE,
+            counted=1,
+            describe=_describe_change(context, number, scale),
+            varies=(number, 0.0, 1.0),
+            moment=at,
+        )
+    yield Candidate(
+        f"drift of {kind}",
+        "constancy",
+        (column * _centre_times(context))[:, None],
+        f"{name} drifts",
+        f"{subject} drifts over the record",
+        describe=_describe_drift(context, number, scale),
+        varies=(number, -0.5, 0.5),
+    )
+    for signal, values in _list_signals(context):
+        yield Candidate(
+            f"change of {kind} with a signal",
+            "constancy",
+            (column * values)[:, None],
+            f"{name} follows {signal}",
+            f"{subject} is no constant: it follows {signal}",
+            f"Write how {name} depends on {signal} in the model's document.",
+            counted=1,
+            describe=_describe_drift(context, number, scale),
             varies=(number, -0.5, 0.5),
         )
-        for signal, values in _list_signals(context):
-            yield Candidate(
-                f"{explanation} with a signal",
-                "constancy",
-                (column * values)[:, None],
-                f"{name} follows {signal}",
-                f"{subject} is no constant: it follows {signal}",
-                f"Write how {name} depends on {signal} in the model's document.",
-                counted=1,
-                describe=_describe_drift(context, number, float(scale[number])),
-                varies=(number, -0.5, 0.5),
-            )
-    if not is_lag_a_clock and context.problem.is_free_run:
-        for at, late, moment in context.find_breaks(clock):
-            yield Candidate(
-                "jump of a clock",
-                "clocks",
-                late[:, None],
-                f"the clocks jump at about {moment}",
-                f"the offset between the clocks of input and output jumps at about {moment}, or "
-                "rows are missing",
-                f"Look for lost rows there. {CUT_THERE}",
-                counted=1,
-                moment=at,
-                doubtful=context.delays,
-            )
+
+
+def _propose_clocks(context: ResidualContext, clock: FloatArray) -> Iterator[Candidate]:
+    """Propose that the clocks jump or drift, which moves the outputs along a column (n,)."""
+    for at, late, moment in context.find_breaks(clock):
         yield Candidate(
-            "drift of a clock",
+            "jump of a clock",
             "clocks",
-            (clock * share)[:, None],
-            "the clocks drift apart",
-            "the clocks of input and output drift apart",
-            "Put both channels on one clock.",
+            late[:, None],
+            f"the clocks jump at about {moment}",
+            f"the offset between the clocks of input and output jumps at about {moment}, or "
+            "rows are missing",
+            f"Look for lost rows there. {CUT_THERE}",
+            counted=1,
+            moment=at,
             doubtful=context.delays,
         )
+    yield Candidate(
+        "drift of a clock",
+        "clocks",
+        (clock * _centre_times(context))[:, None],
+        "the clocks drift apart",
+        "the clocks of input and output drift apart",
+        "Put both channels on one clock.",
+        doubtful=context.delays,
+    )
 
 
 def _list_signals(context: ResidualContext) -> Iterator[tuple[str, FloatArray]]:

@@ -24,13 +24,14 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
     problem = context.problem
     if not problem.is_free_run:
         return
-    inputs = list(_propose_inputs(context))
+    skipped = _count_assumed(context)
+    inputs = list(_propose_inputs(context, skipped))
     yield from inputs
     yield from _propose_restarts(context)
     states, slopes = list_assumed_starts(problem), context.fixed_start_slopes
     for before in (None, *inputs) if slopes else ():
         columns = [] if before is None else [before.columns]
-        skipped = 0 if before is None else _count_assumed(context)
+        skip = 0 if before is None else skipped
         yield Candidate(
             "start",
             "start",
@@ -38,8 +39,8 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
             "the record does not start as the model says",
             f"the record does not start where the model says that {', '.join(states)} does",
             is_added=True,
-            setting=f"Use initial: free and skip: {skipped}." if skipped else "Use initial: free.",
-            change={"initial": "free", **({"skip": skipped} if skipped else {})},
+            setting=f"Use initial: free and skip: {skip}." if skip else "Use initial: free.",
+            change={"initial": "free", **({"skip": skip} if skip else {})},
         )
 
 
@@ -78,9 +79,9 @@ def _propose_restarts(context: ResidualContext) -> Iterator[Candidate]:
             )
 
 
-def _propose_inputs(context: ResidualContext) -> Iterator[Candidate]:
-    """Propose that an input was elsewhere before its first sample."""
-    reach, skipped = compute_reach(context.problem, context.analysis), _count_assumed(context)
+def _propose_inputs(context: ResidualContext, skipped: int) -> Iterator[Candidate]:
+    """Propose that an input was elsewhere before its first sample, which `skipped` ones read."""
+    reach = compute_reach(context.problem, context.analysis)
     for name in context.inputs if reach > 0 else ():
         changed = (_change_history(context, name, reach, span) for span in range(_SPANS))
         columns = [context.compute_effect(records) for records in changed]

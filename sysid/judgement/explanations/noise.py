@@ -13,6 +13,7 @@ from math import lgamma, log
 
 import numpy as np
 
+from sysid.core.robust import estimate_deviation
 from sysid.core.text import join_names
 from sysid.core.types import FloatArray, IntArray
 from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE, UNLIKELY_MOVE
@@ -23,8 +24,12 @@ from sysid.results.findings import Family, Finding, Move
 _OUTLYING = 6.0  # robust deviations: one such innovation, and tails are looked at
 _TAIL_DEGREES = 3.0  # of Student's t
 _LARGE, _MOST_PAIRS = 4.0, 0.3  # robust deviations; share of large innovations that are neighbours
+_SOFT_SCALE = 1.5  # robust deviations: scale of the loss that is advised (H15: Andrews et al. 1972)
 _ROUNDS = 20  # of the scale of Student's t
+_MOST_SQUARE = 8.0  # over the mean: larger squares are outliers, and found by tails
 _LEAST_WEIGHT = 0.05  # of the mean: a variance is not known better
+"""Measured with `benchmarks.judgement`, a record of each of 102 kinds: `_OUTLYING` of 5 or 8,
+`_TAIL_DEGREES` of 2 or 5 and `_MOST_PAIRS` of 0.15 or 0.6 leave all statuses."""
 
 
 def find_noise(context: ResidualContext, fit: ColumnFit) -> Iterator[Finding]:
@@ -64,7 +69,7 @@ def _find_tails(
     context: ResidualContext, fit: ColumnFit, name: str, rows: IntArray
 ) -> Iterator[Finding]:
     values, nu = fit.innovations[rows], _TAIL_DEGREES
-    deviation = 1.4826 * float(np.median(np.abs(values)))
+    deviation = estimate_deviation(values)
     if not np.max(np.abs(values)) > _OUTLYING * deviation or _are_neighbours(values):
         return
     n, gauss = values.size, float(np.mean(np.square(values)))
@@ -81,7 +86,7 @@ def _find_tails(
     weights[rows] = (nu + 1) / (nu + values**2 / max(power, 1e-300))
     moves = _weigh(context, fit, weights)
     residuals = context.residual_model.residuals[rows] / context.weight[rows]
-    scale = 1.5 * 1.4826 * float(np.median(np.abs(residuals)))
+    scale = _SOFT_SCALE * estimate_deviation(residuals)
     count = int(np.count_nonzero(np.abs(values) > _OUTLYING * deviation))
     yield _make_finding(
         "outliers",
@@ -111,16 +116,16 @@ def _find_variance(
     }
     best = (DEFECT_GAIN, "", np.zeros(0))
     relative = squares / mean - 1.0
-    clipped = np.minimum(relative, 8.0)  # outliers are found by tails
+    clipped = np.minimum(relative, _MOST_SQUARE)
     for cause, values in causes.items():
         spread = float(np.std(values))
         if not spread > 0:
             continue
         z = (values - np.mean(values)) / spread
-        slope_ = float(z @ clipped) / z.size
-        gain = z.size * slope_**2 / max(float(np.var(clipped)), 1e-300) - log(z.size)
+        rise = float(z @ clipped) / z.size
+        gain = z.size * rise**2 / max(float(np.var(clipped)), 1e-300) - log(z.size)
         if gain > best[0]:
-            best = (gain, cause, 1.0 + slope_ * z)
+            best = (gain, cause, 1.0 + rise * z)
     gain, cause, variance = best
     if not cause:
         return
@@ -178,7 +183,7 @@ def _weigh(context: ResidualContext, fit: ColumnFit, weights: FloatArray) -> tup
 
 def _are_neighbours(values: FloatArray) -> bool:
     """Whether large values are neighbours of one sign: those of a disturbance, not outliers."""
-    limit = _LARGE * 1.4826 * float(np.median(np.abs(values)))
+    limit = _LARGE * estimate_deviation(values)
     signs = np.where(np.abs(values) > limit, np.sign(values), 0.0)
     pairs = np.count_nonzero(signs[1:] * signs[:-1] > 0)
     return bool(pairs > _MOST_PAIRS * max(int(np.count_nonzero(signs)), 1))

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from sysid.core.types import FloatArray
-from sysid.data.holds import Hold
+from sysid.data.holds import MEANS, Hold
 from sysid.judgement.residual_context import Candidate, ResidualContext
 from sysid.kernels.signals.past_reads import is_difference
 
@@ -61,7 +61,7 @@ def propose(context: ResidualContext) -> Iterator[Candidate]:
 def _propose_means(context: ResidualContext) -> Iterator[Candidate]:
     """Propose that outputs are means of the period after or before their stamps."""
     outputs = [channel for record in context.problem.records for channel in record.outputs]
-    if any(channel.hold in ("mean", "mean-after") for channel in outputs):
+    if any(channel.hold in MEANS for channel in outputs):
         return
     if not all(channel.sampling.is_regular for channel in outputs):
         return

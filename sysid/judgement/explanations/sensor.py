@@ -22,8 +22,11 @@ from sysid.judgement.residual_context import (
 _LIMIT_SAMPLES, _LIMIT_SHARE = 5, 0.02  # equal readings at an end of the range
 _HINGES = (0.0, 0.1, 0.2, 0.3)  # of the range, from its end
 _REPEATED_SHARE = 0.2  # of the samples: readings that equal the one before
+_STUCK = 10  # readings in a row that equal the one before
 _MEANS = (2, 4, 8, 16)  # samples
 _LINE_SHARE, _DRAWN_SHARE = 1e-6, 0.3  # of the range: a bend; of the samples: on lines
+"""Measured with `benchmarks.judgement`, a record of each of 102 kinds: half and twice the shares of
+limits, of repeated readings and of samples on lines leave all statuses."""
 
 
 def propose(context: ResidualContext) -> Iterator[Candidate]:
@@ -155,7 +158,7 @@ def _propose_old_readings(
         if part.output == name:
             measured, simulated = context.measurement[part.rows], context.simulation[part.rows]
             equal = np.concatenate([[False], np.diff(measured) == 0]) & ~_find_limited(measured)
-            is_repeated |= bool(np.mean(equal) > _REPEATED_SHARE) or _count_longest(equal) > 9
+            is_repeated |= bool(np.mean(equal) > _REPEATED_SHARE) or _count_longest(equal) >= _STUCK
             last = np.maximum.accumulate(np.where(equal, 0, np.arange(equal.size)))
             older[part.rows] = simulated[last] - simulated
     if is_repeated:

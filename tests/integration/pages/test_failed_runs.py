@@ -8,8 +8,9 @@ from service.api.app import create_app
 from service.cli.job_commands import _describe_outcome, _describe_state
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
-from service.queue.run_writes import RunOutcome, RunWriter
+from service.queue.run_writes import RunOutcome
 from tests.support.service.web_app import parts_of, recording, settings_of, store_csv
+from tests.support.storage.job_rows import claim, record_outcomes, runs_of
 from tests.support.storage.run_results import write_result
 
 
@@ -19,29 +20,16 @@ def test_a_job_with_failed_runs_says_how_many_and_resumes_these(tmp_path: Path) 
         sweep = {"axes": [{"path": "/seed", "values": [1, 2, 3]}]}
         body = {"model": "fopdt", "datasets": [store_csv(client, recording())], "sweep": sweep}
         assert client.post("/v1/jobs", json=body).status_code == 202
+        got = claim(database)
+        assert got is not None
+        first, *others = [run.id for run in runs_of(database, got.job.id)]
+        record_outcomes(
+            database,
+            got.lease,
+            RunOutcome(run_id=first, state=JobState.SUCCEEDED, best_rms=0.1, result=write_result()),
+            *(RunOutcome(run_id=run, state=JobState.FAILED, error="it diverged") for run in others),
+        )
         with database.write_session() as session:
-            got = LeaseQueue(session).claim_job("test")
-            assert got is not None
-            waiting = RunWriter(session, got.lease).list_pending(limit=3)
-        runs = [run.id for run in waiting]
-        outcomes = [
-            RunOutcome(
-                run_id=runs[0],
-                state=JobState.SUCCEEDED,
-                valid=True,
-                best_rms=0.1,
-                fit_estimation=90.0,
-                evaluations=9,
-                generations=3,
-                seconds=0.1,
-                result=write_result(),
-            )
-        ]
-        outcomes += [
-            RunOutcome(run_id=run, state=JobState.FAILED, error="it diverged") for run in runs[1:]
-        ]
-        with database.write_session() as session:
-            RunWriter(session, got.lease).record_outcomes(outcomes)
             LeaseQueue(session).finish_job(got.lease, JobState.SUCCEEDED, "2 of 3 runs failed")
         job = client.get(f"/v1/jobs/{got.job.id}").json()
         assert (job["state"], job["progress"]["failed"]) == ("succeeded", 2)

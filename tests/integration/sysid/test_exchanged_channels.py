@@ -12,8 +12,7 @@ from tests.support.library.judged_records import (
     FINE,
     NOISE,
     SLOW,
-    STEP,
-    N,
+    TIMES,
     Process,
     draw_levels,
     draw_noise,
@@ -22,7 +21,7 @@ from tests.support.library.judged_records import (
 
 
 def identify_columns(u: np.ndarray, y: np.ndarray) -> Identification:
-    table = pd.DataFrame({"u": u, "y": y}, index=pd.Index(STEP * np.arange(N), name="t"))
+    table = pd.DataFrame({"u": u, "y": y}, index=pd.Index(TIMES, name="t"))
     return identify("fopdt", table, GeneticAlgorithm(generations=60))
 
 

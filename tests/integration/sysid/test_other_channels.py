@@ -2,13 +2,20 @@
 
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from sysid.core.settings import GeneticAlgorithm
 from sysid.identification.identify import identify
 from sysid.results.identification import Identification
-from tests.support.library.judged_records import FAST, FINE, NOISE, STEP, N, draw_levels, draw_noise
+from tests.support.library.judged_records import (
+    FAST,
+    FINE,
+    NOISE,
+    TIMES,
+    N,
+    draw_levels,
+    draw_noise,
+)
 from tests.support.library.judged_records import hold as hold_samples
 
 
@@ -20,10 +27,10 @@ def make_table(acts: float) -> pd.DataFrame:
         "u": u,
         "y": y,
         "valve": valve,
-        "seconds": 3.0 + STEP * np.arange(N),
+        "seconds": 3.0 + TIMES,
         "who": ["Ann"] * N,
     }
-    return pd.DataFrame(columns, index=pd.Index(STEP * np.arange(N), name="t"))
+    return pd.DataFrame(columns, index=pd.Index(TIMES, name="t"))
 
 
 def identify_table(table: pd.DataFrame, **settings: Any) -> Identification:

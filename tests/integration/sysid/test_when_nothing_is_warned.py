@@ -45,19 +45,33 @@ def test_residuals_of_an_estimate_that_is_no_optimum_say_nothing_of_the_model() 
     assert not is_warned(found, "not white")
 
 
+def respond_without_noise(period: float, lag: int, time_constant: float, u: FloatArray) -> Record:
+    """Respond to a held input with a gain of 2, after a lag of whole samples."""
+    read = np.concatenate([np.full(lag, u[0]), u[:-lag]])
+    y, decay = np.full(u.size, 2.0 * u[0]), np.exp(-period / time_constant)
+    for i in range(u.size - 1):
+        y[i + 1] = decay * y[i] + (1 - decay) * 2.0 * read[i]
+    t = period * np.arange(u.size)
+    return Record((Channel("u", t, u),), (Channel("y", t, y),))
+
+
 def test_residuals_of_the_solver_are_no_doubt_about_the_minimum() -> None:
     """Where held input and time lag meet, the integration error has kinks: no optimum, no noise."""
-    t, lag, gain, time_constant = 0.1 * np.arange(600), 0.5, 2.0, 3.0
+    t = 0.1 * np.arange(600)
     command = np.sign(np.sin(0.3 * t) + np.sin(0.17 * t))
-    read = np.concatenate([np.full(5, command[0]), command[:-5]])  # the lag is five samples
-    y, decay = np.full(t.size, gain * command[0]), np.exp(-0.1 / time_constant)
-    for i in range(t.size - 1):
-        y[i + 1] = decay * y[i] + (1 - decay) * gain * read[i]
-    found = identify(FOPDT, Record((Channel("u", t, command),), (Channel("y", t, y),)))
+    found = identify(FOPDT, respond_without_noise(0.1, 5, 3.0, command))
     values = {estimate.name: estimate.value for estimate in found.parameters}
-    assert values["L"] == pytest.approx(lag, abs=1e-4)
+    assert values["L"] == pytest.approx(0.5, abs=1e-4)
     assert not is_warned(found, "not a local optimum")
     assert not is_warned(found, "white")
+
+
+def test_residuals_of_the_solver_are_no_defect_even_at_the_finest_step() -> None:
+    """They are larger than a share of the output, and smaller than what finer steps leave."""
+    command = np.repeat(np.where(np.random.default_rng(1).random(40) < 0.5, -1.0, 1.0), 10)
+    found = identify(FOPDT, respond_without_noise(0.42, 13, 5.29, command))
+    assert found["L"].value == pytest.approx(13 * 0.42, abs=1e-4)
+    assert found.verdict.text == "trustworthy"
 
 
 def test_an_input_that_is_constant_in_one_record_only_is_not_told() -> None:

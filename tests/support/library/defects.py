@@ -14,7 +14,7 @@ from tests.support.library.judged_records import (
     NOISE,
     PLANTS,
     SLOW,
-    STEP,
+    TIMES,
     N,
     Process,
     draw_levels,
@@ -26,7 +26,6 @@ from tests.support.library.judged_records import (
 Defect = Callable[[Process, int], Record]
 LATE = np.arange(N) >= 230
 """The samples (n,) after a change."""
-TIMES = STEP * np.arange(N)
 
 
 def _measure(plant: Process, seed: int, u: FloatArray | None = None) -> FloatArray:

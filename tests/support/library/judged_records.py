@@ -22,6 +22,7 @@ from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
 
 STEP, N, FINE = 0.5, 400, 10
+TIMES = STEP * np.arange(N)
 NOISE = 0.02
 
 

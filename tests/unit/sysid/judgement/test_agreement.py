@@ -11,13 +11,24 @@ from sysid.judgement.agreement import (
     find_better_yardstick,
     find_constant_outputs,
     find_disagreement,
+    find_exchanged_channels,
 )
 from sysid.judgement.yardstick import Yardstick
+from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
 from sysid.results.findings import Finding, Severity
 from sysid.simulation.fit_metrics import ChannelMetrics, Metrics
 from sysid.simulation.problem import Problem
-from tests.support.library.judged_records import N, make_record
+from tests.support.library.judged_records import (
+    FAST,
+    FINE,
+    NOISE,
+    N,
+    draw_levels,
+    draw_noise,
+    hold,
+    make_record,
+)
 from tests.support.library.small_models import LINE
 
 
@@ -152,3 +163,18 @@ def test_a_better_linear_model_is_a_doubt_unless_something_tells_why(
     found = explain_yardstick(explanation)
     assert (found.severity, bool(found.parameters)) == (expected, expected == "caution")
     assert explain_yardstick().severity == "caution"
+
+
+@pytest.mark.parametrize("is_exchanged", [False, True])
+def test_exchanged_channels_are_found_where_the_effect_tells_less_of_its_cause(
+    is_exchanged: bool,
+) -> None:
+    """A filtered signal explains what it is made of less well than the other way round."""
+    u = draw_levels(1)
+    y = FAST.respond(hold(u))[::FINE] + 2.0 * NOISE * draw_noise(1)
+    record = make_record(y, u) if is_exchanged else make_record(u, y)
+    problem = Problem.build(load_model("fopdt"), [record])
+    model = np.full(N, float(np.mean(record.outputs[0].values)))
+    metrics = Metrics(1.0, "V", 0.0, ())
+    found = list(find_exchanged_channels(problem, model, metrics))
+    assert [one.explanation for one in found] == ["exchanged channels"] * is_exchanged

@@ -176,3 +176,25 @@ def test_a_value_out_of_bounds_is_no_reason() -> None:
     moved = replace(ORDER, moves=(Move("L", -1.0, 0.02, -90.0),))
     (_, lag), _ = conclude(moved)
     assert (lag.status, lag.reason) == ("dependent", "the data prefer sopdt")
+
+
+@pytest.mark.parametrize(("gain", "first"), [(200.0, CONSTANT), (300.0, None)])
+def test_why_a_model_fails_takes_half_of_what_it_leaves(gain: float, first: Finding | None) -> None:
+    """Half of the variance of 400 samples is a gain of 400 ln 2 = 277."""
+    step = replace(ORDER, explanation="step of a sensor", gain=gain)
+    assert order_findings([step, CONSTANT], 400)[0] == (first or step)
+    assert order_findings([step, ORDER], 400)[0] == step  # no model fails
+
+
+def test_that_a_model_fails_is_named_once_and_then_why() -> None:
+    little = replace(CONSTANT, explanation="little fit", brief="the model explains little")
+    _, verdict = conclude(CONSTANT, little, replace(ORDER, gain=None))
+    assert verdict.text == (
+        "not trustworthy: the model does not explain the output, and the data prefer sopdt"
+    )
+
+
+def test_what_the_data_do_not_tell_comes_after_what_may_be_why() -> None:
+    lack = replace(ORDER, explanation="no information", gain=None)
+    drift = replace(ORDER, explanation="coloured noise", gain=None)
+    assert order_findings([lack, drift]) == (drift, lack)

@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sysid.core.types import FloatArray
+from sysid.judgement.explanations import constancy, history, reading
 from sysid.judgement.judge import explain_residuals
 from sysid.judgement.levels import DEFECT_GAIN
 from sysid.models.catalogue.load import load_model
@@ -28,6 +30,8 @@ from tests.support.library.judged_records import (
     NOISE,
     PLANTS,
     SLOW,
+    TIMES,
+    N,
     Process,
     build_context,
     draw_levels,
@@ -200,3 +204,52 @@ def test_a_change_is_not_looked_for_where_a_record_begins() -> None:
     moments = [moment for moment, *_ in context.find_late(np.ones(context.times.size))]
     assert context.times[150] in moments
     assert context.times[2] not in moments
+
+
+def test_an_offset_of_the_output_changes_as_its_sensor_does() -> None:
+    context = build_context([draw_record(FAST, 1)], "fopdt", FAST.values)
+    briefs = [one.brief for one in constancy.propose(context)]
+    assert any(brief.startswith("K changes") for brief in briefs)
+    assert not any(brief.startswith("y0") for brief in briefs)
+
+
+@pytest.mark.parametrize("is_regular", [True, False])
+def test_means_have_periods_so_irregular_samples_are_none(is_regular: bool) -> None:
+    u = draw_levels(1)
+    uneven = np.sort(np.random.default_rng(1).uniform(0.0, TIMES[-1], N))
+    record = make_record(u, FAST.respond(hold(u))[::FINE], times=TIMES if is_regular else uneven)
+    context = build_context([record], "fopdt", FAST.values)
+    settings = [one.setting for one in reading.propose(context)]
+    expected = ["Use hold: {u: first}.", "Use hold: {u: mean}.", "", "Use hold: {y: mean-after}."]
+    assert settings == ([*expected, "Use hold: {y: mean}."] if is_regular else ["", ""])
+
+
+@pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.model)
+def test_a_sensor_that_is_stuck_for_a_short_time_is_named(plant: Process) -> None:
+    def stick(y: FloatArray) -> FloatArray:
+        return np.where((np.arange(N) >= 100) & (np.arange(N) < 116), y[100], y)
+
+    found = explain_output(plant, 1, stick).findings
+    assert found[0].explanation == "repeated reading"
+
+
+def test_outliers_at_the_end_are_no_variance_that_follows_time() -> None:
+    def spoil(y: FloatArray) -> FloatArray:
+        late = np.arange(N - 36, N, 3)
+        spoilt = y.copy()
+        spoilt[late] += 20.0 * NOISE * np.resize([1.0, -1.0], late.size)
+        return spoilt
+
+    names = list_names(explain_output(FAST, 1, spoil))
+    assert "outliers" in names
+    assert "unequal variance" not in names
+
+
+def test_what_is_tried_of_a_start_is_what_is_advised() -> None:
+    context = build_context([draw_record(FAST, 1)], "fopdt", FAST.values, initial="rest")
+    skipped = [
+        (one.change, re.search(r"skip: (\d+)", one.setting)) for one in history.propose(context)
+    ]
+    assert any(told for _, told in skipped)
+    for change, told in skipped:
+        assert change.get("skip") == (int(told[1]) if told else None)

@@ -1,7 +1,8 @@
 """The judge: the likeliest explanations, one beside the other, on one scale."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,18 +11,24 @@ from sysid.core.settings import Loss
 from sysid.data.records import Channel, Record
 from sysid.judgement import judge
 from sysid.judgement.conclusions import order_findings
-from sysid.judgement.judge import Explained, explain_residuals, select_explanations
+from sysid.judgement.judge import (
+    Explained,
+    explain_residuals,
+    leaves_noise,
+    select_explanations,
+)
 from sysid.judgement.levels import DEFECT_GAIN, STRONG_ODDS
 from sysid.judgement.residual_context import Candidate, ResidualContext, Simulations
 from sysid.models.parse import parse_model
 from sysid.results.findings import Finding, note
 from sysid.uncertainty.analysis import analyse_estimate
-from tests.support.library.defects import CONSTANCY, LATE, SENSOR, TIMES
+from tests.support.library.defects import CONSTANCY, LATE, SENSOR
 from tests.support.library.judged_records import (
     FAST,
     FINE,
     NOISE,
     STEP,
+    TIMES,
     N,
     build_context,
     draw_levels,
@@ -255,11 +262,10 @@ def test_two_experiments_in_one_record_have_the_same_parameters() -> None:
 
 def test_after_a_gap_another_experiment_begins() -> None:
     """The input moved in the gap, so no sample after it says where the plant was."""
-    times = STEP * np.arange(N)
-    u = np.where((times > 100.0) & (times < 130.0), 2.0, draw_levels(1))
+    u = np.where((TIMES > 100.0) & (TIMES < 130.0), 2.0, draw_levels(1))
     y = FAST.respond(hold(u))[::FINE] + NOISE * draw_noise(1)
-    kept = (times < 60.0) | (times > 130.0)
-    record = make_record(u[kept], y[kept], times=times[kept])
+    kept = (TIMES < 60.0) | (TIMES > 130.0)
+    record = make_record(u[kept], y[kept], times=TIMES[kept])
     (first, *_) = explain(FAST, record).findings
     assert first.explanation == "another experiment"
     assert "at about 130.5 s, after a gap" in first.text
@@ -316,3 +322,117 @@ def test_what_was_found_first_is_the_reason() -> None:
     found = explain(FAST, make_record(u, y)).findings
     assert found[0].explanation in ("drift of a clock", "drift of a time lag")
     assert order_findings(found)[0] == found[0]
+
+
+def propose_step(
+    explanation: str, size: float, **fields: Any
+) -> Callable[[ResidualContext], Iterator[Candidate]]:
+    """Propose that the output jumps by so much, in words that are not those of a sensor."""
+
+    def propose(context: ResidualContext) -> Iterator[Candidate]:
+        columns = context.weigh(size * LATE)
+        yield Candidate(explanation, "structure", columns, "it jumps", "it jumps", **fields)
+
+    return propose
+
+
+def propose_ramp(context: ResidualContext) -> Iterator[Candidate]:
+    columns = context.weigh(TIMES)
+    yield Candidate("a ramp", "structure", columns, "it jumps", "it jumps in another way")
+
+
+def use_proposers(
+    monkeypatch: pytest.MonkeyPatch, *proposers: Callable[[ResidualContext], Iterator[Candidate]]
+) -> None:
+    monkeypatch.setattr(judge, "_PROPOSERS", proposers)
+    monkeypatch.setattr(judge, "_FREE_PROPOSERS", ())
+    monkeypatch.setattr(judge, "_COSTLY_PROPOSERS", ())
+
+
+def test_what_is_taken_twice_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_proposers(monkeypatch, propose_step("a step", 1.0), propose_ramp)
+    found = explain_line(0.5 * LATE, 0.004 * TIMES).findings
+    assert [one.brief for one in found if not one.is_of_noise] == ["it jumps"]
+
+
+@pytest.mark.parametrize("has_rival", [False, True])
+def test_a_setting_is_advised_only_if_nothing_is_as_likely(
+    has_rival: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    u = draw_levels(1)
+    y = 2.0 * u + 1.0 + NOISE * draw_noise(1)
+    sound, jumping = make_record(u, y), make_record(u, y + 0.3 * LATE)
+    rival = [propose_step("a rival", 2.0)] if has_rival else []
+    fields = {"setting": "Use it.", "change": {"records": [sound]}, "doubtful": ("b",)}
+    use_proposers(monkeypatch, propose_step("a step", 1.0, **fields), *rival)
+    (found,) = explain_residuals(
+        build_context([jumping], parse_model(LINE), {"a": 2.0, "b": 1.0})
+    ).findings
+    assert ("Use it." in found.advice) is not has_rival
+    assert ("As likely" in found.text) is has_rival
+
+
+@pytest.mark.parametrize("excess", [-0.002, -0.01, 0.5])
+def test_a_fit_that_ends_at_a_bound_is_no_cure(excess: float) -> None:
+    context = build_context([draw_record(FAST, 1)], "fopdt", FAST.values)
+    lag = float(context.theta[context.problem.free_names.index("L")])
+    bounded = context.problem.rebuild(parameters={"L": {"upper": lag + excess}})
+    start = np.clip(context.theta, bounded.evaluator.lower, bounded.evaluator.upper)
+    assert leaves_noise(bounded, start, Simulations()) is (excess > 0.0)
+
+
+@pytest.mark.parametrize("seed", [13, 14])
+def test_a_likely_explanation_without_a_gain_opens_the_costly_ones(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+
+    def propose_costly(context: ResidualContext) -> Iterator[Candidate]:
+        calls.append(context)
+        return iter(())
+
+    monkeypatch.setattr(judge, "_COSTLY_PROPOSERS", (propose_costly,))
+    context = build_context([draw_record(FAST, seed)], "fopdt", FAST.values)
+    assert explain_residuals(context).findings == ()
+    assert calls == [context]
+
+
+def test_samples_of_repeats_are_no_series() -> None:
+    u = draw_levels(1)
+    y = 2.0 * u + 1.0 + NOISE * draw_noise(1) + 0.3 * LATE
+    for repeats in (None, np.repeat(np.arange(4.0), N // 4)):
+        output = Channel("y", TIMES, y, repeats=repeats)
+        record = Record((Channel("u", TIMES, u, hold="zero"),), (output,))
+        explained = explain_residuals(
+            build_context([record], parse_model(LINE), {"a": 2.0, "b": 1.0})
+        )
+        assert explained.is_done is bool(explained.findings) is (repeats is None)
+
+
+@pytest.mark.parametrize(("size", "is_cure"), [(0.0, True), (0.008, False)])
+def test_a_cure_leaves_nothing_that_may_be_a_defect(
+    size: float, is_cure: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Something with strong odds is left, but not with those of a defect."""
+
+    def propose_wave(context: ResidualContext) -> Iterator[Candidate]:
+        columns = context.weigh(np.sin(TIMES))
+        yield Candidate("a wave", "structure", columns, "it waves", "it waves")
+
+    use_proposers(monkeypatch, propose_wave)
+    u = draw_levels(1)
+    y = 2.0 * u + 1.0 + NOISE * draw_noise(1) + size * np.sin(TIMES)
+    context = build_context([make_record(u, y)], parse_model(LINE), {"a": 2.0, "b": 1.0})
+    explained = explain_residuals(context)
+    assert explained.is_done
+    assert explained.is_doubtful is not is_cure
+    assert explained.findings == ()
+    assert leaves_noise(context.problem, context.theta, Simulations()) is is_cure
+
+
+def test_another_order_takes_the_place_of_its_columns() -> None:
+    columns = [make_finding(name, 30.0, "L") for name in ("one more time constant", "outliers")]
+    order = make_finding("order", 28.0, "L")
+    assert select_explanations(columns, [order]) == (columns[1], order)
+    weak = make_finding("order", 11.0, "L")
+    assert select_explanations(columns, [weak]) == tuple(columns)

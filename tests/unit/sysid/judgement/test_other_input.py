@@ -21,6 +21,7 @@ from tests.support.library.judged_records import (
     PLANTS,
     SLOW,
     STEP,
+    TIMES,
     N,
     Process,
     build_context,
@@ -30,8 +31,6 @@ from tests.support.library.judged_records import (
     hold,
     make_record,
 )
-
-TIMES = STEP * np.arange(N)
 
 
 def lag(values: FloatArray, samples: float) -> FloatArray:
@@ -170,3 +169,24 @@ def test_a_search_is_not_sent_what_it_does_not_read() -> None:
     problem = build_context([record], "fopdt", FAST.values).problem
     assert problem.records[0].others
     assert not pickle.loads(pickle.dumps(problem)).records[0].others
+
+
+def test_what_an_input_drives_late_is_no_input() -> None:
+    """The plant has a second path, which a sensor on it sees before the output does."""
+    for seed in range(3):
+        u = draw_levels(seed)
+        late = np.append(np.full(45, u[0]), u[:-45])
+        acts = lag(np.append(np.full(6, u[0]), late[:-6]), 5.0)
+        y = FAST.respond(hold(u))[::FINE] + 0.3 * acts + NOISE * draw_noise(seed)
+        record = add_channels(make_record(u, y), w=late + 0.02 * draw_noise(seed + 50))
+        assert not find_others(explain(FAST, record))
+
+
+def test_a_better_sensor_of_a_load_is_no_input() -> None:
+    for seed in (0, 2):
+        u = draw_levels(seed)
+        load = lfilter([1.0], [1.0, -0.97], draw_noise(seed + 70))
+        clean = FAST.respond(hold(u))[::FINE] + load
+        record = make_record(u, clean + draw_noise(seed))
+        second = add_channels(record, w=clean + 0.01 * draw_noise(seed + 50))
+        assert not find_others(explain(FAST, second))

@@ -24,6 +24,7 @@ from tests.support.library.judged_records import (
     FAST,
     NOISE,
     STEP,
+    TIMES,
     N,
     build_context,
     draw_noise,
@@ -31,8 +32,6 @@ from tests.support.library.judged_records import (
     make_record,
 )
 from tests.support.library.small_models import LINE
-
-TIMES = STEP * np.arange(N)
 
 
 def make_step(first: int, response: int) -> Record:

@@ -80,6 +80,14 @@ def test_a_doubt_that_moves_nothing_is_a_note() -> None:
     assert "the same estimates" in found.text
 
 
+def test_a_reading_that_is_likelier_makes_what_it_moves_dependent_inside_its_interval_too() -> None:
+    moved = replace(LINES, estimates_other={"L": 1.985, "K": 2.005})  # by 1.5 and 0.5 of its error
+    assert [one.severity for one in find(moved, "It fits better")] == ["note"]
+    likelier = 0.1 * np.exp(-9.0 / (2 * PROBLEM.n_scored))  # a gain of 9
+    (found,) = find(replace(moved, rms_other=float(likelier)), "It fits better")
+    assert (found.severity, found.parameters) == ("caution", ("L",))
+
+
 def test_what_held_samples_would_give_as_lines_is_a_note_if_it_moves_an_estimate() -> None:
     (found,) = find(HELD)
     assert (found.severity, found.parameters) == ("note", ())

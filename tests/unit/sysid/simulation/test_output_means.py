@@ -14,10 +14,9 @@ from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model, replace_substeps
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
-from tests.support.library.judged_records import FAST, FINE, STEP, N, draw_levels, hold
+from tests.support.library.judged_records import FAST, FINE, STEP, TIMES, N, draw_levels, hold
 from tests.support.library.small_models import difference
 
-TIMES = STEP * np.arange(N)
 U = draw_levels(4)
 VALUES = {**FAST.values, "x(0)": 0.0}
 

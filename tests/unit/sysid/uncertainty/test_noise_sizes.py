@@ -11,18 +11,12 @@ from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.intervals import Alternative, AverageOverNoise, compose_interval
 from sysid.uncertainty.noise_sizes import NoisePoints, explore_noise_sizes
+from tests.support.library.small_models import LINE
 
 PERIOD, SAMPLES = 0.5, 50
 LOAD = Loss(noise_model="load")
-LINE = {
-    "name": "line",
-    "form": "differential",
-    "inputs": {"u": "1"},
-    "states": {"x": "1"},
-    "parameters": {"a": {"lower": -5, "upper": 5}, "b": {"lower": -5, "upper": 5}},
-    "equations": {"x": "-x"},
-    "outputs": {"y": "a*u(t) + b + x"},
-    "initial": {"x": 0},
+DRIFTING_LINE = {
+    **LINE,
     "solver": {"substeps": 8},
     "noise": {"load": {"y": "estimate"}},
 }
@@ -40,7 +34,7 @@ def build_line() -> tuple[Problem, FloatArray, FloatArray]:
     y = 1.5 * u - 0.7 + drift + 0.1 * random.normal(size=SAMPLES)
     record = Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
     columns = np.column_stack([u, np.ones(SAMPLES)])
-    return Problem.build(parse_model(LINE), [record], loss=LOAD), columns, y
+    return Problem.build(parse_model(DRIFTING_LINE), [record], loss=LOAD), columns, y
 
 
 def fit_dense(
