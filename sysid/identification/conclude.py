@@ -1,12 +1,13 @@
 """Conclude a search: refinement, uncertainty, validation, warnings."""
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from math import inf
 
 import numpy as np
 
-from sysid.core.errors import DivergedEverywhere, NothingIdentifiable
+from sysid.core.errors import DivergedEverywhere, NothingIdentifiable, SysidError
 from sysid.core.jit import read_clock
 from sysid.core.settings import FoundNoiseModel, GeneticAlgorithm, StartKind
 from sysid.core.threads import use_one_thread
@@ -77,9 +78,11 @@ from sysid.residuals.residual_tests import list_residual_series, run_residual_te
 from sysid.results.findings import Finding, note
 from sysid.results.identification import Identification
 from sysid.results.result import Agreements, FitPercent, Identifiability, KnownBefore
+from sysid.search.refine import refine_candidates
 from sysid.search.state import Improvement, IslandSummary
 from sysid.simulation.free_run import convert_to_free_run
 from sysid.simulation.problem import Problem, compute_metrics
+from sysid.simulation.start_values import convert_point
 from sysid.uncertainty.estimates import CorrelationMatrix, Uncertainty
 from sysid.uncertainty.posterior import describe_posterior, sample_posterior
 from sysid.uncertainty.unequal_noise import describe_unequal_noise
@@ -341,14 +344,21 @@ def _build_identification(
 def _measure_free_run(problem: Problem, theta: FloatArray) -> Yardstick | None:
     """Compare the free run beside a filter with a linear black box, but in a loop.
 
-    An unstable plant is recorded in one, and its free run is of no use.
+    It is fitted by squares first, from estimated starts if it may have them. The comparison is safe
+    because the model was fitted to the samples that it is compared on. An unstable plant is
+    recorded in a loop, and its free run is of no use.
     """
     if not problem.model.corrections:
         return None
     free, point = convert_to_free_run(problem, theta)
     if compute_growth(free, point) >= MIN_GROWTH:
         return None
-    simulated = free.predict(point[None])[0]
+    started = free
+    with suppress(SysidError):  # some model has no such start
+        started = free.rebuild(initial="free")
+    free, point = started, convert_point(free, started, point)
+    (end,) = refine_candidates(free, [point])
+    simulated = free.predict((point if end is None else end.theta)[None])[0]
     if describe_feedback(list_residual_series(free, simulated)):
         return None
     return fit_yardstick(free, simulated)
