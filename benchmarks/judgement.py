@@ -241,9 +241,8 @@ def read_advice(found: Identification) -> tuple[str, ...]:
     return (*(f"model={name}" for name in models), *read_settings(typed))
 
 
-def _write_options(field: str, entries: Mapping[str, str]) -> str:
-    prefix = f"{field}." if field else ""
-    return " ".join(f"--set {prefix}{name}={value}" for name, value in entries.items())
+def _write_options(place: Sequence[str], entries: Mapping[str, str]) -> str:
+    return " ".join(f"--set {'.'.join([*place, name])}={value}" for name, value in entries.items())
 
 
 def read_settings(text: str) -> tuple[str, ...]:

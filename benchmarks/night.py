@@ -67,6 +67,7 @@ def list_parts(seed: int) -> dict[str, Part]:
         "fuzz": program("benchmarks.fuzz", "--seed", str(seed)),
         "attacks": program("benchmarks.attacks"),
         "libraries": program("benchmarks.dependencies"),
+        "versions of Ray": program("benchmarks.ray_versions"),
         "measured data": program("benchmarks.real_data.all"),
     }
 

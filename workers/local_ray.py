@@ -20,7 +20,6 @@ from workers.errors import ClusterUnavailable
 from workers.ray_folders import (
     clear_dead_dispatchers,
     find_folder_processes,
-    get_inner_folder,
     get_ray_folder,
     kill_processes,
 )
@@ -49,6 +48,8 @@ RAY_ENVIRONMENT = {
     # Lower priority than the service, but not than everything else, as Ray's default of 15.
     "RAY_worker_niceness": "5",
 }
+TEMPORARY_VARIABLE = "RAY_TMPDIR"
+"""Where Ray makes its folder `ray`."""
 _UNUSED_STARTS = ("start_monitor", "start_log_monitor", "start_api_server")
 """Methods of Ray's `Node` that start the autoscaler, the collector of logs and the dashboard."""
 
@@ -166,13 +167,12 @@ def _start_ray(ray: Any, cpus: int | None, folder: Path) -> None:
 
 def _init_ray(ray: Any, cpus: int | None, folder: Path) -> None:
     # Ray's workers import from the working folder first, so it is one without anybody's modules.
-    with _skip_unused_programs(), chdir(folder):
+    with _skip_unused_programs(), _put_files_into(folder), chdir(folder):
         ray.init(
             address="local",  # never a cluster that happens to run on this host
             num_cpus=cpus,
             include_dashboard=False,
             object_store_memory=OBJECT_STORE_BYTES,
-            _temp_dir=str(get_inner_folder(folder)),
             **INIT_ARGUMENTS,
         )
 
@@ -181,11 +181,19 @@ def _init_ray(ray: Any, cpus: int | None, folder: Path) -> None:
 def _skip_unused_programs() -> Iterator[None]:
     """Skip three programs of Ray that are not used here, a fifth of the cost of its start.
 
-    Ray has no setting for this. A version of Ray with other methods starts them as before.
+    Ray has no setting for this, so private names are used here, and nowhere else. A version of Ray
+    without them starts these programs, and the log says so.
     """
-    from ray._private.node import Node
-
+    try:
+        from ray._private.node import Node
+    except ImportError:
+        Node = None
     originals = {name: getattr(Node, name) for name in _UNUSED_STARTS if hasattr(Node, name)}
+    if missing := [name for name in _UNUSED_STARTS if name not in originals]:
+        _log.warning(
+            "this version of Ray has no %s: it also starts programs that are not needed",
+            ", ".join(missing),
+        )
     try:
         for name in originals:
             setattr(Node, name, _start_nothing)
@@ -193,6 +201,20 @@ def _skip_unused_programs() -> Iterator[None]:
     finally:
         for name, method in originals.items():
             setattr(Node, name, method)
+
+
+@contextmanager
+def _put_files_into(folder: Path) -> Iterator[None]:
+    """Let a Ray that starts in the block have its files in this folder."""
+    before = os.environ.get(TEMPORARY_VARIABLE)
+    os.environ[TEMPORARY_VARIABLE] = str(folder)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[TEMPORARY_VARIABLE]
+        else:
+            os.environ[TEMPORARY_VARIABLE] = before
 
 
 def _start_nothing(_node: Any, *_arguments: Any, **_settings: Any) -> None:

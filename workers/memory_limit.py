@@ -4,13 +4,12 @@ Without a limit the memory of the machine fills up. The kernel or Ray then kills
 always the one that took the memory: Ray kills the youngest task first.
 """
 
-import contextlib
-import os
 import resource
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
+from sysid.core.machine import read_memory_bytes
 from workers.protocol import Encoder, PackResult, Records, WorkItem
 from workers.tasks import run_pack
 
@@ -20,10 +19,7 @@ MEMORY_SHARE = 0.8
 
 def compute_worker_memory(workers: int) -> int:
     """Compute the memory limit of each of `workers` workers on this machine, in bytes."""
-    total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
-        total = min(total, int(Path("/sys/fs/cgroup/memory.max").read_text()))
-    return int(MEMORY_SHARE * total / workers)
+    return int(MEMORY_SHARE * read_memory_bytes() / workers)
 
 
 def process_pack_within(

@@ -17,6 +17,7 @@ from typing import Any
 
 import psutil
 
+from sysid.core.awake_clock import read_awake_seconds
 from sysid.identification.fingerprint import compute_fingerprint
 from workers.cluster_address import check_address, explain_failure
 from workers.errors import ClusterLost, ClusterUnavailable, PackCancelled, PackFailed, WorkerDied
@@ -94,7 +95,8 @@ class RayExecutor:
         self._noop = ray.remote(num_cpus=0, max_retries=0)(_answer_probe)
         self._in_flight: set[Any] = set()
         self._probe: Any = None
-        self._last_answer = self._last_process_check = time.monotonic()
+        self._last_answer = read_awake_seconds()
+        self._last_process_check = time.monotonic()
         self._vital_pids = () if settings.address else _find_vital_processes()
         self._most_slots, self._start_seconds = settings.cpus, settings.start_seconds
         self._shared_slots: int | None = None
@@ -138,7 +140,7 @@ class RayExecutor:
             self._ray.cancel(pending, force=False)
         if self._local is None:
             _require_same_program(fingerprints)
-        self._last_answer = time.monotonic()
+        self._last_answer = read_awake_seconds()
 
     def share_records(self, records: Records) -> Any:
         """Put records into the object store; afterwards only the reference is sent."""
@@ -168,7 +170,7 @@ class RayExecutor:
             ready, _ = self._ray.wait(
                 in_flight, num_returns=len(in_flight), timeout=0, fetch_local=False
             )
-            self._last_answer = time.monotonic()
+            self._last_answer = read_awake_seconds()
         return tuple(ready)
 
     def fetch_results(self, handle: PackHandle) -> PackResult:
@@ -210,14 +212,14 @@ class RayExecutor:
             If a process of a local Ray is gone, or a no-op task has not been answered in time.
         """
         self._check_processes_alive()
-        silence = time.monotonic() - self._last_answer
+        silence = read_awake_seconds() - self._last_answer
         if self._probe is None:
             if silence > SILENCE_SECONDS:
                 self._probe = self._noop.remote()
             return
         answered, _ = self._ray.wait([self._probe], timeout=0)
         if answered:
-            self._probe, self._last_answer = None, time.monotonic()
+            self._probe, self._last_answer = None, read_awake_seconds()
         elif silence > SILENCE_SECONDS + ANSWER_SECONDS:
             raise ClusterLost(f"Ray has not answered for {silence:.0f} s")
 

@@ -14,7 +14,7 @@ import psutil
 
 from sysid.core.machine import make_machine_tag
 
-_MAX_BASE_LENGTH = 20  # rest of a socket's path, after all names and numbers of seven digits
+_MAX_BASE_LENGTH = 18  # rest of a socket's path, after all names and numbers of seven digits
 
 
 def get_ray_folder(pid: int) -> Path:
@@ -27,7 +27,7 @@ def get_ray_folder(pid: int) -> Path:
 
 def get_inner_folder(folder: Path) -> Path:
     """Return Ray's own folder inside the private one. Ray opens all its folders to everybody."""
-    return folder / "r"
+    return folder / "ray"
 
 
 def find_folder_processes(pid: int) -> tuple[int, ...]:

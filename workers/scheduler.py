@@ -5,6 +5,7 @@ import time
 from collections.abc import Hashable, Iterable, Mapping
 from typing import Generic, TypeVar
 
+from sysid.core.awake_clock import read_awake_seconds
 from workers.errors import PackFailed, PackLost, WorkerDied
 from workers.fair_share import FairShare
 from workers.job_queue import JobQueue, SharedWork
@@ -65,7 +66,7 @@ class Scheduler(Generic[Key]):
         self._shared: dict[Hashable, SharedWork] = {}  # by account
         self._stopped: dict[Key, float] = {}  # time of the stop request; inf once forced
         self._watch: PackWatch[PackHandle] = PackWatch()
-        self._checked_at = time.monotonic()
+        self._checked_at = read_awake_seconds()
         self._killed: dict[PackHandle, float] = {}  # packs whose workers were killed, and when
         self._silent: dict[PackHandle, str] = {}  # those of them that were overdue, and how
         self._abandoned: set[PackHandle] = set()  # those of them that no job waits for
@@ -257,11 +258,11 @@ class Scheduler(Generic[Key]):
         for handle in self._jobs[job].in_flight:
             self._executor.cancel_pack(handle, force=force)
             if force:
-                self._killed.setdefault(handle, time.monotonic())
+                self._killed.setdefault(handle, read_awake_seconds())
 
     def _replace_silent_workers(self) -> None:
         """Kill workers that have a pack beyond its time limit, and give their packs away."""
-        now = time.monotonic()
+        now = read_awake_seconds()
         if now - self._checked_at < CHECK_SECONDS:
             return
         self._checked_at = now

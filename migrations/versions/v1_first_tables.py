@@ -26,6 +26,7 @@ TIME = sa.DateTime(timezone=True)
 STATE = sa.String(16)
 TABLES = (
     "projects",
+    "requested_work",
     "api_keys",
     "web_sessions",
     "audit_log",
@@ -111,6 +112,14 @@ def _create_owners() -> None:
         _column("max_daily_evaluations", LARGE, nullable=True),
     )
     _index("projects", "name", unique=True)
+    _create(
+        "requested_work",
+        _column("project_id"),
+        _column("hour", TIME),
+        _column("evaluations", LARGE),
+        _refer("requested_work", "project_id", "projects"),
+        key=("project_id", "hour"),
+    )
     _create(
         "api_keys",
         _column("id"),

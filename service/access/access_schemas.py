@@ -12,9 +12,9 @@ class LimitsOut(Answer):
 
     max_open_jobs: int = Field(description="most jobs that wait or run")
     max_open_runs: int = Field(description="most runs of these jobs that have not ended")
-    max_stored_bytes: int | None = Field(description="most bytes of recordings")
+    max_stored_bytes: int | None = Field(description="most bytes of recordings and results")
     max_daily_evaluations: int | None = Field(
-        description="most simulations of jobs that ran in the last 24 hours"
+        description="most simulations of the last 24 hours, of jobs that ran and of requests"
     )
 
 
@@ -23,8 +23,10 @@ class UseOut(Answer):
 
     open_jobs: int = Field(description="jobs that wait or run")
     open_runs: int = Field(description="runs of these jobs that have not ended")
-    stored_bytes: int = Field(description="bytes of recordings")
-    daily_evaluations: int = Field(description="simulations of jobs that ran in the last 24 hours")
+    stored_bytes: int = Field(description="bytes of recordings, and of results at 8.4 kB a run")
+    daily_evaluations: int = Field(
+        description="simulations of the last 24 hours, of jobs that ran and of requests"
+    )
 
 
 class AccessOut(Answer):

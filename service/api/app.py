@@ -15,7 +15,7 @@ from service.api.requests import problems
 from service.api.requests.access_check import AccessCheck
 from service.api.requests.dependencies import Parts
 from service.api.requests.html_answers import PRIVATE_HEADERS, PROTECTIVE_HEADERS
-from service.api.requests.middleware import BodyLimit, OriginCheck, ResponseHeaders
+from service.api.requests.middleware import BodyLimit, BodyPace, OriginCheck, ResponseHeaders
 from service.api.requests.query_names import check_query_names
 from service.api.requests.request_log import RequestLog
 from service.api.requests.request_root_path import RootPath
@@ -65,6 +65,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     problems.install_handlers(app)
     app.add_middleware(BodyLimit, limit=chosen.max_body_bytes)
+    app.add_middleware(BodyPace)
     if chosen.auth_mode != "off":
         app.add_middleware(ResponseHeaders, headers=PRIVATE_HEADERS)
     app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=list(chosen.proxy_addresses))

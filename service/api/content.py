@@ -4,7 +4,6 @@ Objects are sent with ranges, ETags and cross-origin headers, which MCAP viewers
 body goes to a temporary file; its bytes are hashed and counted as they arrive.
 """
 
-import asyncio
 import hashlib
 import re
 from collections.abc import AsyncIterator, Iterator
@@ -20,20 +19,17 @@ from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
-from starlette.types import Message, Receive
 
 from service.core.bodies.text_checks import parse_digits
 from service.core.errors import (
     InvalidRequest,
-    ServiceBusy,
     StaleVersion,
-    StalledRequest,
     TooLarge,
     UnsatisfiableRange,
     UnsupportedMediaType,
 )
 from service.core.process import temporary_files
-from service.core.process.concurrency import MAX_WAIT_SECONDS
+from service.core.process.concurrency import FairPlaces
 from service.core.settings import Settings
 from service.datasets.datasets import check_upload_size
 
@@ -195,7 +191,6 @@ FILE_TYPES = frozenset(
 """Media types of files that may hold a recording; which kind it is, its bytes say."""
 MULTIPART = "multipart/form-data"
 PIECE_BYTES = 1 << 20
-MAX_PAUSE_SECONDS = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,19 +205,17 @@ class Upload:
 
 @asynccontextmanager
 async def receive_upload(
-    request: Request, settings: Settings, places: asyncio.Semaphore
+    request: Request, settings: Settings, places: FairPlaces, project: str
 ) -> AsyncIterator[Upload]:
     """Receive the body as a file that exists until the block ends.
 
-    The block has one of `places`. A body that waits for one is not read yet: it waits with its
-    sender, and needs neither disk nor thread.
+    The block has one of the `places` of its project. A body that waits for one is not read yet: it
+    waits with its sender, and needs neither disk nor thread.
 
     Raises
     ------
     ServiceBusy
         If no place became free in time.
-    StalledRequest
-        If the sender pauses for too long.
     TooLarge
         As soon as the announced or received bytes exceed the limit.
     UnsupportedMediaType
@@ -239,8 +232,7 @@ async def receive_upload(
         check_upload_size(parse_digits(announced), settings)
     elif kind == MULTIPART:
         raise TooLarge("a form needs a Content-Length header, so that its size can be checked")
-    request = Request(request.scope, _limit_pauses(request.receive))
-    async with _take_place(places):
+    async with places.hold_awaiting(project):
         with TemporaryDirectory(prefix=temporary_files.make_temporary_prefix()) as folder:
             path = Path(folder) / "upload"
             if kind == MULTIPART:
@@ -248,34 +240,6 @@ async def receive_upload(
             else:
                 digest = await _save_body(request.stream(), path, settings)
                 yield Upload(path, digest, suffix=".mcap" if kind in MCAP_TYPES else "")
-
-
-def _limit_pauses(receive: Receive) -> Receive:
-    """Limit the time until the next piece of a body: a sender that stops must not keep a place."""
-
-    async def receive_in_time() -> Message:
-        try:
-            async with asyncio.timeout(MAX_PAUSE_SECONDS):
-                return await receive()
-        except TimeoutError:
-            raise StalledRequest(f"nothing of the body came for {MAX_PAUSE_SECONDS:g} s") from None
-
-    return receive_in_time
-
-
-@asynccontextmanager
-async def _take_place(places: asyncio.Semaphore) -> AsyncIterator[None]:
-    try:
-        async with asyncio.timeout(MAX_WAIT_SECONDS):
-            await places.acquire()
-    except TimeoutError:
-        raise ServiceBusy(
-            "as many uploads as are allowed at once are on their way (LAGID_MAX_UPLOADS); try again"
-        ) from None
-    try:
-        yield
-    finally:
-        places.release()
 
 
 async def _receive_form(request: Request, path: Path, settings: Settings) -> Upload:

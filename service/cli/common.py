@@ -225,8 +225,10 @@ def print_error(message: str) -> None:
 
 
 def check_succeeded(job: Mapping[str, Any]) -> None:
-    """End the command with the reason if a finished job did not succeed."""
-    if job["state"] != "succeeded":
+    """End the command with the reason if a finished job has no result; tell of failed runs."""
+    if job["state"] == "incomplete":
+        print_error(f"{job['id']}: {job['error']}")
+    elif job["state"] != "succeeded":
         reason = f": {job['error']}" if job["error"] else ""
         fail(f"{job['id']} {job['state']}{reason}")
 
@@ -582,10 +584,9 @@ class FieldOrigins:
         """Rewrite a note so that it names options instead of job fields."""
         return rewrite_settings(note, self._format_setting)
 
-    def _format_setting(self, field: str, entries: Mapping[str, str]) -> str:
+    def _format_setting(self, place: Sequence[str], entries: Mapping[str, str]) -> str:
         origins = {
-            self.locate(join_pointer(*filter(None, (field, name)))): value
-            for name, value in entries.items()
+            self.locate(join_pointer(*place, name)): value for name, value in entries.items()
         }
         return " ".join(
             f"{origin}{'=' if origin.startswith('--set ') else ' '}{value}"

@@ -140,7 +140,12 @@ _PANELS: Mapping[str, Mapping[str, tuple[Callable[..., None] | str, *tuple[str, 
         ),
         "db": ("retention_command:app",),
         "health": ("health_command:check_health", "lagid health web", "lagid health dispatcher"),
-        "doctor": ("server_processes:check_installation", "lagid doctor", "lagid doctor --json"),
+        "doctor": (
+            "server_processes:check_installation",
+            "lagid doctor",
+            "lagid doctor --deep",
+            "lagid doctor --json",
+        ),
     },
 }
 

@@ -7,7 +7,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import partial
 from importlib.metadata import version
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import AsJson, ask_to_go_on, err, out, print_json, show_examples
-from service.core.errors import Misconfigured, Unavailable
+from service.core.errors import Misconfigured, ServiceError, Unavailable
 from service.core.extras import check_extra, list_missing
 
 if TYPE_CHECKING:
@@ -166,9 +166,12 @@ def open_listener(host: str, port: int) -> socket.socket:
 def _run_server(
     settings: "Settings", listener: socket.socket, supervisor: "Supervisor | None"
 ) -> None:
+    import asyncio
+
     import uvicorn
 
     from service.api.app import create_app
+    from service.api.connections import limit_connections, tell_accept_errors_seldom
     from service.core.process.logs import configure_logging
     from service.core.process.loop_watch import LoopWatch, end_if_standing
     from service.dispatch.supervisor import RESTART_EXIT_CODE
@@ -181,6 +184,10 @@ def _run_server(
 
     class Server(uvicorn.Server):
         """Server that stops open event streams and the dispatcher as soon as it must end."""
+
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            tell_accept_errors_seldom(asyncio.get_running_loop())
+            await super().startup(sockets)
 
         async def on_tick(self, counter: int) -> bool:
             loop.turn()
@@ -204,6 +211,7 @@ def _run_server(
         proxy_headers=False,  # the application believes them, of the proxies in its settings
         timeout_graceful_shutdown=SHUTDOWN_SECONDS,
     )
+    limit_connections(config, settings.max_connections)
     Server(config).run(sockets=[listener])
 
 
@@ -409,7 +417,18 @@ def check_database(
         raise typer.Exit(1)
 
 
-def check_installation(data_dir: DataDir = None, as_json: AsJson = False) -> None:
+Deep = Annotated[
+    bool,
+    typer.Option(
+        "--deep",
+        help="Also a drill of a minute: a job, a worker that dies, a backup and its restoration.",
+    ),
+]
+
+
+def check_installation(
+    data_dir: DataDir = None, deep: Deep = False, as_json: AsJson = False
+) -> None:
     """Check the installation: packages, kernels, data folder, port."""
     checks: list[tuple[str, Callable[[], str]]] = [
         ("Python", _check_python),
@@ -425,18 +444,37 @@ def check_installation(data_dir: DataDir = None, as_json: AsJson = False) -> Non
             ("data folder", lambda: _check_folder(settings)),
             ("port", lambda: _check_port(settings)),
         ]
-    found: list[dict[str, Any]] = []
-    for name, look in checks:
-        try:
-            found.append({"check": name, "ok": True, "detail": look()})
-        except (Misconfigured, ImportError, OSError, ArithmeticError) as error:
-            found.append({"check": name, "ok": False, "detail": str(error)})
-        if not as_json:
-            _print_check(**found[-1])
+    with ExitStack() as used:
+        if deep:
+            check_extra("server", "`lagid doctor --deep`")
+            from service.cli.drill import Drill
+
+            drill = used.enter_context(Drill(load_settings(data_dir=data_dir)))
+            checks += [
+                ("drill: start", drill.start_service),
+                ("drill: a worker dies", drill.survive_kill),
+                ("drill: backup", drill.restore_backup),
+            ]
+        found = _carry_out(checks, as_json=as_json)
     if as_json:
         print_json(found)
     if not all(entry["ok"] for entry in found):
         raise typer.Exit(1)
+
+
+def _carry_out(
+    checks: Sequence[tuple[str, Callable[[], str]]], *, as_json: bool
+) -> list[dict[str, Any]]:
+    """Carry out the checks, each after the other, and tell of each unless that is left to JSON."""
+    found: list[dict[str, Any]] = []
+    for name, look in checks:
+        try:
+            found.append({"check": name, "ok": True, "detail": look()})
+        except (ServiceError, ImportError, OSError, ArithmeticError) as error:
+            found.append({"check": name, "ok": False, "detail": str(error)})
+        if not as_json:
+            _print_check(**found[-1])
+    return found
 
 
 def _print_check(check: str, ok: bool, detail: str) -> None:

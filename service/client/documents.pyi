@@ -660,7 +660,7 @@ class FindingDocument(TypedDict):
     moves: list[MoveDocument]
     """what each parameter would be, the furthest move first"""
     parameters: list[str]
-    """parameters that it makes doubtful"""
+    """parameters that it makes doubtful; those that a note is about"""
     status: Literal[
         "identified",
         "not settled",
@@ -911,8 +911,8 @@ class JobDocument(TypedDict):
     """identifier, `job_…`"""
     name: str
     """name of the job"""
-    state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
-    """state of the job"""
+    state: Literal["queued", "running", "succeeded", "failed", "cancelled", "incomplete"]
+    """state of the job; `incomplete`: it has ended, and some of its runs have failed"""
     cancel_requested: NotRequired[bool]
     """whether it was asked to stop, and has not yet"""
     created_at: str
@@ -1012,9 +1012,9 @@ class LimitsDocument(TypedDict):
     max_open_runs: int
     """most runs of these jobs that have not ended"""
     max_stored_bytes: int | None
-    """most bytes of recordings"""
+    """most bytes of recordings and results"""
     max_daily_evaluations: int | None
-    """most simulations of jobs that ran in the last 24 hours"""
+    """most simulations of the last 24 hours, of jobs that ran and of requests"""
 
 class LineageEdgeDocument(TypedDict):
     """`child` was made from `parent`."""
@@ -1171,6 +1171,8 @@ class ModelParameterDocument(TypedDict):
     """value at which it is held, in `unit`"""
     tied: NotRequired[str | None]
     """expression that gives its value"""
+    physical: NotRequired[str | None]
+    """bounds that are limits of the quantity: lower, upper or both"""
 
 class MoveDocument(TypedDict):
     """What a parameter would be under an explanation."""
@@ -1301,6 +1303,8 @@ class ParameterInDocument(TypedDict):
     """value at which the parameter is held, in its unit"""
     tied: NotRequired[str | None]
     """expression of other parameters that gives the value"""
+    physical: NotRequired[Literal["lower", "upper", "both"] | None]
+    """bounds that are limits of the quantity itself"""
 
 class ParameterSummaryDocument(TypedDict):
     """Summary of one parameter over the runs of a group, in its unit."""
@@ -2016,9 +2020,9 @@ class UseDocument(TypedDict):
     open_runs: int
     """runs of these jobs that have not ended"""
     stored_bytes: int
-    """bytes of recordings"""
+    """bytes of recordings, and of results at 8.4 kB a run"""
     daily_evaluations: int
-    """simulations of jobs that ran in the last 24 hours"""
+    """simulations of the last 24 hours, of jobs that ran and of requests"""
 
 class ValidationInDocument(TypedDict):
     """Validation data: other datasets, or the last fraction of each record."""

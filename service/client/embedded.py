@@ -5,7 +5,7 @@ import signal
 import socket
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
@@ -13,7 +13,7 @@ from pathlib import Path
 import httpx
 
 from service.core.errors import ServiceDidNotStart
-from sysid.core.child_processes import build_child_command, build_import_path
+from sysid.core.child_processes import SAFE_FOLDER, build_child_command, build_import_path
 
 START_LIMIT_SECONDS = 240.0
 """A first start compiles the loops, which takes minutes on a busy machine."""
@@ -22,7 +22,11 @@ STOP_LIMIT_SECONDS = 20.0
 
 @contextmanager
 def run_embedded_service(
-    data_dir: str | PathLike[str], *, port: int | None = None, cpus: int | None = None
+    data_dir: str | PathLike[str],
+    *,
+    port: int | None = None,
+    cpus: int | None = None,
+    environment: Mapping[str, str] | None = None,
 ) -> Iterator[str]:
     """Start `lagid serve` as a child process, wait until it is ready, and stop it at the end.
 
@@ -34,6 +38,9 @@ def run_embedded_service(
         Port on loopback; a free one by default.
     cpus : int, optional
         Cores for the workers; all by default.
+    environment : mapping, optional
+        All variables of the service, which then reads no file `lagid.env`. By default it has those
+        of this process, and reads the file of the working folder.
 
     Yields
     ------
@@ -49,14 +56,18 @@ def run_embedded_service(
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     chosen_port = port or find_free_port()
     url = f"http://127.0.0.1:{chosen_port}"
-    command = build_child_command("service.cli.main", "serve", "--data-dir", str(folder))
+    command = build_child_command("service.cli.main", "serve", "--data-dir", str(folder.absolute()))
     command += ["--host", "127.0.0.1", "--port", str(chosen_port)]
     command += ["--cpus", str(cpus)] if cpus else []
     log = folder / "serve.log"
     with log.open("ab") as sink:
         child = subprocess.Popen(
             command,
-            env={**os.environ, "PYTHONPATH": build_import_path()},
+            env={
+                **(os.environ if environment is None else environment),
+                "PYTHONPATH": build_import_path(),
+            },
+            cwd=None if environment is None else SAFE_FOLDER,
             stdout=sink,
             stderr=sink,
             stdin=subprocess.DEVNULL,

@@ -14,7 +14,7 @@ from service.control.loop_answer import (
     simulate_closed_loop,
 )
 from service.core.errors import FieldError, InvalidRequest
-from service.core.process.concurrency import simulation_limit
+from service.core.process.concurrency import simulation_places
 from service.datasets.dataset_schemas import DatasetOut
 from service.datasets.datasets import (
     add_recording,
@@ -26,6 +26,7 @@ from service.datasets.datasets import (
 from service.datasets.simulated import check_finite_outputs, check_given_delays
 from service.datasets.waveforms import InputSignals, interpolate_channel
 from service.jobs.stored_run import StoredRun, load_estimated_run
+from service.queue.daily_limit import check_budget, count_evaluations
 from service.repositories.dataset_rows import DatasetRepository
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
@@ -58,7 +59,6 @@ class _SimulationResult:
     notes: list[str]
 
 
-@simulation_limit.acquire()
 def simulate_run(
     database: Database, store: ObjectStore, run_id: str, body: RunSimulationIn, max_points: int
 ) -> RunSimulationOut:
@@ -73,6 +73,16 @@ def simulate_run(
     InvalidRequest
         With every fault of the inputs and parameters, or where the simulation diverges.
     """
+    check_budget(database)
+    with simulation_places.hold(database.owner.project_id):
+        answer = _simulate_run(database, store, run_id, body, max_points)
+    count_evaluations(database, 1)
+    return answer
+
+
+def _simulate_run(
+    database: Database, store: ObjectStore, run_id: str, body: RunSimulationIn, max_points: int
+) -> RunSimulationOut:
     with database.read_session() as session:
         request = _read_request(session, store, run_id, body)
     loop = _simulate_loop(request, body.control) if body.control else None

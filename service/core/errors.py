@@ -5,7 +5,7 @@
     - ForeignOrigin          403  a page of another origin sent a request that changes something
     - OutOfScope             403  the API key does not allow this request
     - NotFound               404  the dataset, model, job or run does not exist
-    - StalledRequest         408  the sender of a body stopped
+    - StalledRequest         408  the sender of a body stopped or was too slow
     - Conflict               409  the state of the resource does not allow the request
     - StaleVersion           412  a precondition (If-Match) does not hold
     - TooLarge               413  the body exceeds a limit
@@ -149,7 +149,7 @@ class DatasetNotFound(ServiceError):
 
 
 class StalledRequest(ServiceError):
-    """The sender of a body stopped."""
+    """The sender of a body stopped, or was too slow."""
 
     status, kind, title = 408, "stalled", "The body did not arrive"
 

@@ -11,6 +11,11 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from service.core.errors import Misconfigured
 from service.core.process.logs import LogFormat
+from sysid.core.machine import read_memory_bytes
+
+READERS_SHARE = 0.6
+"""Share of the memory for all readers of uploads: 3 GiB of 5 GiB, beside 1 GiB of the web process
+and the compiler's."""
 
 
 def make_sqlite_url(path: Path) -> str:
@@ -82,11 +87,18 @@ class Settings(BaseSettings):
     """Largest recording. A larger one is answered by 413."""
     max_body_bytes: int = Field(default=4 * 1024**2, ge=1)
     """Largest body of any other request; 413 beyond. About 40,000 labelled values of a sweep have
-    room. In any case 100,000 lists and objects with 200,000 fields are the most."""
+    room. In any case 100,000 lists and objects with 200,000 fields are the most. A body that stops
+    for 60 s, or sends fewer than 500 bytes a second after its first 20 s, is answered by 408."""
     max_uploads: int = Field(default=4, ge=1)
-    """Uploads that one web process receives and reads at once, each with up to 4 GiB of memory for
-    120 s. Others wait, and are answered by 503 after 20 s. A sender that stops for 60 s is answered
-    by 408."""
+    """Uploads that one web process reads at once, each for at most 120 s, and that a project sends
+    at once. Projects share the places, and one project has all but one at most. Others wait, and
+    are answered by 503 after 20 s."""
+    reader_memory_mb: int | None = Field(default=None, ge=512)
+    """Memory of the reader of an upload, in MiB. Without it: a share of 60 % of the machine or the
+    container, 4 GiB at most."""
+    max_connections: int = Field(default=1000, ge=1)
+    """Connections of one web process, within its limit of open files. Beyond, one without a request
+    makes room, else 503. The head of a request must come within 20 s."""
     max_streams: int = Field(default=500, ge=1)
     """Event streams of one web process; 503 beyond."""
     max_runs_per_job: int = Field(default=100_000, ge=1)
@@ -178,6 +190,17 @@ class Settings(BaseSettings):
     def worker_memory_bytes(self) -> int | None:
         """Memory of a worker in bytes."""
         return None if self.worker_memory_mb is None else self.worker_memory_mb * 2**20
+
+    @property
+    def reader_memory_bytes(self) -> int:
+        """Memory of the reader of an upload, in bytes: all readers at once leave room for others.
+
+        Below 512 MiB the libraries of the reader cannot even be loaded.
+        """
+        if self.reader_memory_mb is not None:
+            return self.reader_memory_mb * 2**20
+        share = int(READERS_SHARE * read_memory_bytes() / self.max_uploads)
+        return min(4 * 2**30, max(512 * 2**20, share))
 
     @property
     def store_location(self) -> str:

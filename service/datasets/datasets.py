@@ -28,6 +28,7 @@ from service.datasets.dataset_schemas import (
 )
 from service.datasets.stored_recordings import load_recording
 from service.formats.file_kinds import SUFFIXES, detect_kind
+from service.formats.limits import DEFAULT_LIMITS, UploadLimits
 from service.formats.mcap.mcap_files import write_recording
 from service.formats.sandbox import read_untrusted
 from service.repositories.dataset_rows import DatasetRepository, NewDataset, StoredDataset
@@ -38,6 +39,7 @@ from service.repositories.lineage_rows import (
     find_tombstones,
     list_dataset_names,
 )
+from service.repositories.project_rows import check_room
 from service.repositories.search_conditions import NO_FILTER, ListFilter
 from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database, release_connection
@@ -114,6 +116,7 @@ def add_upload(
     name: str | None = None,
     segments: Sequence[str] = (),
     sample_time: float | None = None,
+    limits: UploadLimits = DEFAULT_LIMITS,
 ) -> StoredDataset:
     """Store an uploaded file, or return the existing dataset of the same bytes.
 
@@ -140,7 +143,7 @@ def add_upload(
     if existing is not None:
         return StoredDataset(existing, is_new=False)
     # Reading takes time. An open transaction would block all others on SQLite.
-    read = read_untrusted(path, suffix=suffix, segments=segments, sample_time=sample_time)
+    read = read_untrusted(path, limits, suffix=suffix, segments=segments, sample_time=sample_time)
     details = {"source": read_as, "warnings": list(read.notes)}
     return add_recording(
         database,
@@ -215,7 +218,7 @@ def add_recording(
     # The source of an upload is its file; that of others follows from parents and request.
     file = (details.get("source") or {}).get("sha256", "") if kind == "upload" else ""
     metadata = {"source": file, "source_key": key, "parents": " ".join(parents), "name": name}
-    content = _store_file(store, recording, metadata)
+    content = _store_file(database, store, recording, metadata, is_new=existing is None)
     new = describe_recording(
         recording, name=name, kind=kind, key=key, details=details, content=content
     )
@@ -347,11 +350,19 @@ def _hash_derivation(parent: Dataset, body: DeriveIn) -> str:
 
 
 def _store_file(
-    store: ObjectStore, recording: Recording, metadata: Mapping[str, str]
+    database: Database,
+    store: ObjectStore,
+    recording: Recording,
+    metadata: Mapping[str, str],
+    *,
+    is_new: bool,
 ) -> StoredObject:
     with tempfile.TemporaryDirectory(prefix=temporary_files.make_temporary_prefix()) as folder:
         path = Path(folder) / "recording.mcap"
         write_recording(recording, path, metadata=metadata)
+        if is_new:  # what is refused leaves no object behind
+            with database.read_session() as session:
+                check_room(session, path.stat().st_size)
         return store.put_file(path)
 
 

@@ -1,6 +1,7 @@
 """Use case: a dataset simulated from a model or a plant, with inputs and noise."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
-from service.core.process.concurrency import simulation_limit
+from service.core.process.concurrency import FairPlaces, simulation_places
 from service.datasets.dataset_schemas import InputIn, SimulateIn
 from service.datasets.datasets import (
     add_recording,
@@ -19,6 +20,7 @@ from service.datasets.datasets import (
 from service.datasets.plants import simulate_plant
 from service.datasets.waveforms import InputSignals
 from service.models import models
+from service.queue.daily_limit import check_budget, count_evaluations
 from service.repositories.dataset_rows import StoredDataset, build_dataset_row
 from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database
@@ -28,6 +30,10 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
 from sysid.models.model import DerivedInitial, FixedInitial, Model
 from sysid.models.model_delays import check_delays
+
+LARGE_SAMPLES = 1_000_000
+_large_places = FairPlaces(1, 1, what="simulations of more than a million samples")
+"""One of these at a time: a sample takes some 370 bytes meanwhile (10⁷ of two channels)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +76,6 @@ class SimulatedDataset:
         )
 
 
-@simulation_limit.acquire()
 def simulate_dataset(database: Database, store: ObjectStore, body: SimulateIn) -> StoredDataset:
     """Simulate a model or a plant as a dataset; the same body returns the same dataset.
 
@@ -79,10 +84,21 @@ def simulate_dataset(database: Database, store: ObjectStore, body: SimulateIn) -
     InvalidRequest
         With every fault: unknown model, parameter or signal, a missing value, a bad expression.
     """
-    if body.plant is not None:
-        return simulate_plant(database, store, body)
-    dataset = simulate_or_find(database, store, body)
-    return dataset if isinstance(dataset, StoredDataset) else dataset.store_dataset(database, store)
+    check_budget(database)
+    project = database.owner.project_id
+    with ExitStack() as places:
+        if (body.samples or 0) > LARGE_SAMPLES:
+            places.enter_context(_large_places.hold(project))
+        places.enter_context(simulation_places.hold(project))
+        if body.plant is not None:
+            made = simulate_plant(database, store, body)
+            count_evaluations(database, 1)
+            return made
+        dataset = simulate_or_find(database, store, body)
+        if isinstance(dataset, StoredDataset):
+            return dataset
+        count_evaluations(database, 1)
+        return dataset.store_dataset(database, store)
 
 
 def simulate_or_find(

@@ -75,7 +75,7 @@ class HeldLeases:
         self.owner = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
         self._database, self._length = database, timedelta(seconds=seconds)
         self._clock, self._stopwatch = clock, stopwatch
-        self.loop = LoopWatch(stopwatch)
+        self.loop = LoopWatch()
         self._held: dict[Lease, float] = {}  # when each was renewed
         self._has_asked = False  # a claim was sent and not answered
         self.n_alive = 1

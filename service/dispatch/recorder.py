@@ -19,7 +19,7 @@ from service.dispatch.checkpoints import pack_state
 from service.dispatch.fitted_signals import store_signals
 from service.dispatch.history_points import to_history_points, to_migrant_points
 from service.dispatch.overlap import RunBeside, run_at_once
-from service.queue.leases import Claim, JobProgress, LeaseQueue
+from service.queue.leases import Claim, FinalState, JobProgress, LeaseQueue
 from service.queue.packed_results import PackedResults
 from service.queue.previous_attempts import (
     PreviousAttempts,
@@ -397,10 +397,10 @@ class RunRecorder:
             if job.n_reused:
                 text = f"{job.n_reused} of {job.n_runs} runs were taken over from earlier runs"
                 queue.append_event(self.lease, "log", {"message": text})
+            state: FinalState = JobState.INCOMPLETE if job.n_failed else JobState.SUCCEEDED
             if job.n_failed == job.n_runs:
-                queue.finish_job(self.lease, JobState.FAILED, complaint)
-            else:
-                queue.finish_job(self.lease, JobState.SUCCEEDED, complaint)
+                state = JobState.FAILED
+            queue.finish_job(self.lease, state, complaint)
 
         self._write_now(last=end)
 

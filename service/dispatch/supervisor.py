@@ -15,6 +15,7 @@ import psutil
 
 from service.core.process.process_identity import is_stopped
 from service.core.settings import Settings
+from sysid.core.awake_clock import read_awake_seconds
 from sysid.core.child_processes import SAFE_FOLDER, build_child_command, build_import_path
 from workers.ray_folders import clear_ray_remains, kill_processes
 
@@ -173,15 +174,15 @@ def _open_private(path: str, flags: int) -> int:
 
 def _wait_for_end(child: "subprocess.Popen[bytes]") -> int:
     """Wait for the end of a child and return its exit code."""
-    awake = time.monotonic()
+    awake = read_awake_seconds()
     while True:
         try:
             return child.wait(POLL_SECONDS)
         except subprocess.TimeoutExpired:
             pass
         if not is_stopped(child.pid):
-            awake = time.monotonic()
-        elif time.monotonic() - awake > STOPPED_SECONDS:
+            awake = read_awake_seconds()
+        elif read_awake_seconds() - awake > STOPPED_SECONDS:
             _log.warning(
                 "the dispatcher was stopped (SIGSTOP) for %g s and is killed", STOPPED_SECONDS
             )

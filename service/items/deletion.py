@@ -162,6 +162,8 @@ def _delete_run(session: Session, item: Item) -> None:
     job = session.get_one(Job, run.job_id)
     if run.state is JobState.FAILED:
         job.n_failed -= 1
+        if job.state is JobState.INCOMPLETE and not job.n_failed:
+            job.state = JobState.SUCCEEDED
     elif run.state is JobState.CANCELLED:
         job.n_done += 1
     session.flush()

@@ -28,7 +28,7 @@ from sysid.core.settings import (
 )
 from sysid.data.records import HoldSetting
 from sysid.identification.options import RunOptions
-from sysid.models.parameters import ParameterScale
+from sysid.models.parameters import ParameterScale, PhysicalBounds
 from sysid.results.verdict import Trust
 
 WholeNumber = Annotated[int, Field(gt=-(2**62), lt=2**62)]
@@ -51,6 +51,9 @@ class ParameterIn(Body):
         default=None,
         max_length=1000,
         description="expression of other parameters that gives the value",
+    )
+    physical: PhysicalBounds | None = Field(
+        default=None, description="bounds that are limits of the quantity itself"
     )
 
 
@@ -369,7 +372,9 @@ class JobOut(Answer):
 
     id: str = Field(description="identifier, `job_…`")
     name: str = Field(description="name of the job")
-    state: StateName = Field(description="state of the job")
+    state: StateName = Field(
+        description="state of the job; `incomplete`: it has ended, and some of its runs have failed"
+    )
     cancel_requested: bool = Field(
         default=False, description="whether it was asked to stop, and has not yet"
     )

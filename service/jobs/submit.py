@@ -37,7 +37,11 @@ from service.queue.admission import count_unfinished
 from service.queue.run_writes import NewRun, insert_runs
 from service.repositories.dataset_rows import DatasetRepository
 from service.repositories.job_rows import JobRepository, NewJob, Submission
-from service.repositories.project_rows import ProjectRepository, check_daily_evaluations
+from service.repositories.project_rows import (
+    ProjectRepository,
+    check_bytes,
+    check_daily_evaluations,
+)
 from service.repositories.run_rows import RunRepository
 from service.repositories.search_conditions import NO_FILTER, ListFilter
 from service.storage.columns import utc_now
@@ -175,6 +179,7 @@ def check_limits(session: Session, job: Job, settings: Settings) -> None:
             f"At most {max_runs} may be open. Cancel some, or submit this job later"
         )
     check_daily_evaluations(session, job.project_id, limits.max_daily_evaluations)
+    check_bytes(session, job.project_id, limits.max_stored_bytes)
 
 
 def resume_job(

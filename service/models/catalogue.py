@@ -52,7 +52,7 @@ def to_builtin_out(name: str, *, with_document: bool = False) -> ModelOut:
 
 def to_model_out(model: Model, version: int, document: Mapping[str, Any] | None) -> ModelOut:
     """Convert a model to an answer; built-in models have version 0."""
-    fields = ("lower", "upper", "bounds", "unit", "scale", "fixed", "tied")
+    fields = ("lower", "upper", "bounds", "unit", "scale", "fixed", "tied", "physical")
     return ModelOut.from_source(
         model,
         version=version,

@@ -17,6 +17,9 @@ class ModelParameterOut(Answer):
     scale: str = Field(description="scale on which the search moves")
     fixed: Finite = Field(default=None, description="value at which it is held, in `unit`")
     tied: str | None = Field(default=None, description="expression that gives its value")
+    physical: str | None = Field(
+        default=None, description="bounds that are limits of the quantity: lower, upper or both"
+    )
 
 
 class ModelDocumentOut(Answer):

@@ -214,4 +214,5 @@ def _describe_range(one: ModelParameterOut) -> str:
         return f"fixed at {one.fixed:.6g}"
     if one.bounds is not None:
         return f"follows the data: {RULES[one.bounds]}"
-    return f"{one.lower:.6g} … {one.upper:.6g}".replace("-", "−")
+    limit = "" if one.physical is None else f" ({one.physical}: physical)"
+    return f"{one.lower:.6g} … {one.upper:.6g}".replace("-", "−") + limit

@@ -9,7 +9,7 @@ from typing import Any
 from service.core.bodies.job_fields import DATASETS_PATH
 from service.core.bodies.wire import Answer
 from service.core.label_text import format_count, format_value
-from service.core.states import OPEN_STATES, JobState, StateName, describe_state
+from service.core.states import OPEN_STATES, JobState, RunStateName, describe_state
 from service.items.items import compute_etag
 from service.jobs.job_schemas import JobOut, OutcomeOut
 from service.jobs.outcomes import is_batch
@@ -27,7 +27,7 @@ class RunView(Answer):
     id: str
     number: int
     title: str
-    state: StateName
+    state: RunStateName
     is_open: bool
     cell_text: str
     unit: str
@@ -70,8 +70,8 @@ class JobView(JobOut):
 
     @property
     def has_failed_runs(self) -> bool:
-        """Whether some of the runs of a job that succeeded have failed."""
-        return self.state == "succeeded" and self.progress.failed > 0
+        """Whether some of the runs of a job that has ended have failed."""
+        return self.state == "incomplete"
 
     @property
     def state_text(self) -> str:
@@ -103,7 +103,7 @@ class JobView(JobOut):
     def share(self) -> float:
         """Share that is done, from 0 to 1: by runs, or by generations of a single run."""
         done = self.progress
-        if self.state == "succeeded":
+        if self.state in ("succeeded", "incomplete"):
             return 1.0
         if done.runs > 1 or self.state == "queued":
             return min(done.finished / max(done.runs, 1), 1.0)

@@ -1,20 +1,53 @@
-"""Stop the jobs of projects that have used up their evaluations of a day.
+"""Evaluations of a day: jobs of projects that have used them up are stopped, requests refused.
 
 A submission is refused at once. But what a job will cost is not known before, so each dispatcher
 looks with its heartbeat. A stopped job keeps its results and checkpoints, and can be resumed.
+What a web process computes on request counts too, whatever the scope of the key.
 """
 
 import logging
+from contextlib import suppress
+
+from sqlalchemy.exc import OperationalError
 
 from service.repositories.job_rows import JobRepository
-from service.repositories.project_rows import list_overruns
+from service.repositories.project_rows import (
+    add_requested_work,
+    check_daily_evaluations,
+    list_overruns,
+)
 from service.storage.sessions import Database, SessionOwner
 from service.storage.storage_errors import RowConflict, RowNotFound
+from service.storage.tables import Project
 
 _log = logging.getLogger(__name__)
 
 ACTOR = "daily limit"
 """Who cancels, in the audit log."""
+
+
+NOTE_BUSY_SECONDS = 0.5
+"""How long the note of a request's work waits for the lock of others; then it is not counted."""
+
+
+def check_budget(database: Database) -> None:
+    """Refuse a request that computes, if its project has used up its evaluations of a day.
+
+    Raises
+    ------
+    BudgetExceeded
+        With the numbers, and when to try again.
+    """
+    with database.read_session() as session:
+        project = session.get(Project, database.owner.project_id)
+        if project is not None:
+            check_daily_evaluations(session, project.id, project.max_daily_evaluations)
+
+
+def count_evaluations(database: Database, evaluations: int) -> None:
+    """Count what a request has computed."""
+    with suppress(OperationalError), database.write_session(NOTE_BUSY_SECONDS) as session:
+        add_requested_work(session, evaluations)
 
 
 def stop_overruns(database: Database, busy_seconds: float | None = None) -> list[str]:

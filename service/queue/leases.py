@@ -60,7 +60,7 @@ Then this one is hardly the reason why the dispatchers die.
 _DEFER_SPEC = defer(Job.spec)
 """A specification of many cells has megabytes; it is loaded only where it is needed."""
 _FRESH = {"populate_existing": True}
-FinalState = Literal[JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED]
+FinalState = Literal[JobState.SUCCEEDED, JobState.INCOMPLETE, JobState.FAILED, JobState.CANCELLED]
 SizeRule = Callable[[Job], int]
 """Tells how many runs of a job a new parcel has at most."""
 
@@ -361,7 +361,7 @@ class LeaseQueue:
     def finish_job(self, lease: Lease, state: FinalState, error: str | None = None) -> Job:
         """End a job, and with it all its parcels and unfinished runs.
 
-        A job that succeeds must have none.
+        A job that succeeds or is incomplete must have none.
 
         Raises
         ------
@@ -373,7 +373,7 @@ class LeaseQueue:
         self.lock_lease(lease)
         lock_parcels(self._session, lease.job_id)
         job = self._lock_job(lease.job_id)
-        if state is JobState.SUCCEEDED:
+        if state in (JobState.SUCCEEDED, JobState.INCOMPLETE):
             self._check_runs_finished(job.id, range(job.n_runs))
         self._end_job(job, state, error)
         return job

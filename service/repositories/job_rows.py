@@ -243,7 +243,7 @@ class JobRepository:
         """Queue a failed or cancelled job again; successful runs keep their results.
 
         Only this request of a user leaves a terminal state. With `only_failed` it takes the failed
-        runs alone, also of a job that has succeeded.
+        runs alone, also of a job that is incomplete.
 
         Raises
         ------
@@ -254,7 +254,7 @@ class JobRepository:
         again = [state for state in JobState if state is not JobState.SUCCEEDED]
         allowed = [JobState.FAILED, JobState.CANCELLED]
         if only_failed:
-            again, allowed = [JobState.FAILED], [JobState.FAILED, JobState.SUCCEEDED]
+            again, allowed = [JobState.FAILED], [JobState.FAILED, JobState.INCOMPLETE]
         if job.state not in allowed or (only_failed and not job.n_failed):
             raise RowConflict(_explain_no_resume(job, only_failed=only_failed))
         chosen = update(Run).where(
@@ -414,7 +414,7 @@ def end_job(
     session.flush()
     parcels = delete(Parcel).where(Parcel.job_id == job.id)
     session.execute(parcels, execution_options={"synchronize_session": False})
-    if state is not JobState.SUCCEEDED:
+    if state in (JobState.FAILED, JobState.CANCELLED):
         end_open_runs(session, job.id, state, error)
     record_best_run(session, job)
     EventRepository(session).append_state(job)

@@ -4,20 +4,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import timedelta
 
-from sqlalchemy import case, func, select
+from sqlalchemy import ColumnElement, case, delete, func, select, update
 from sqlalchemy.orm import Session
 
 from service.core.errors import BudgetExceeded
 from service.core.states import OPEN_STATES
 from service.repositories.audit_rows import record_action
 from service.storage.columns import utc_now
-from service.storage.statements import new_id
+from service.storage.garbage import MINIMUM_AGE
+from service.storage.sessions import find_project
+from service.storage.statements import insert_missing, new_id
 from service.storage.storage_errors import RowConflict, RowNotFound
-from service.storage.tables import Dataset, Job, Project
+from service.storage.tables import Dataset, Job, Project, RequestedWork
 
 DAY = timedelta(days=1)
 FULL_RETRY_SECONDS = 3600.0
 """When to try again if only a deletion makes room."""
+RESULT_BYTES = 8400
+"""Bytes of the result of a run with its history: 71 MB of SQLite for 8,498 runs, measured."""
+REMOVAL_TIME = MINIMUM_AGE + timedelta(hours=1)
+"""The bytes of a deleted recording are there for that time; the store is cleared every hour."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +35,10 @@ class ProjectLimits:
     max_open_jobs, max_open_runs : int or None
         Unfinished jobs, and their unfinished runs.
     max_stored_bytes : int or None
-        Bytes of the stored recordings.
+        Bytes of the stored recordings and results. With those that are deleted but still there,
+        at most twice as many.
     max_daily_evaluations : int or None
-        Evaluations of the jobs that ran in the last 24 hours.
+        Evaluations of the last 24 hours: of jobs that ran, and of requests.
     """
 
     max_open_jobs: int | None = None
@@ -126,7 +133,7 @@ def read_limits(project: Project) -> ProjectLimits:
 
 
 def check_stored_bytes(session: Session, project_id: str) -> None:
-    """Refuse a recording just stored if its project now exceeds its limit of stored bytes.
+    """Refuse what was just added if its project now exceeds its limit of stored bytes.
 
     Raises
     ------
@@ -134,13 +141,44 @@ def check_stored_bytes(session: Session, project_id: str) -> None:
         With the numbers; the caller's transaction ends with it.
     """
     limit = ProjectRepository(session).lock_limits(project_id).max_stored_bytes
+    check_bytes(session, project_id, limit)
+
+
+def check_room(session: Session, size: int) -> None:
+    """Refuse a recording of `size` bytes before it is written, if its project has no room for it.
+
+    Raises
+    ------
+    BudgetExceeded
+        With the numbers.
+    """
+    project = session.get(Project, find_project(session))
+    if project is not None:
+        check_bytes(session, project.id, project.max_stored_bytes, size)
+
+
+def check_bytes(session: Session, project_id: str, limit: int | None, new: int = 0) -> None:
+    """Refuse `new` bytes, and what was just added, beyond the limit that was read.
+
+    Raises
+    ------
+    BudgetExceeded
+        With the numbers.
+    """
     if limit is None:
         return
-    stored = count_stored_bytes(session, project_id)
+    stored = count_stored_bytes(session, project_id) + new
     if stored > limit:
         raise BudgetExceeded(
-            f"with this recording the project would store {stored} bytes; at most {limit} are "
-            "allowed. Delete recordings, or ask the operator for more (`lagid project limit`)",
+            f"with this the project would store {stored} bytes; at most {limit} are allowed. "
+            "Delete recordings or jobs, or ask the operator for more (`lagid project limit`)",
+            FULL_RETRY_SECONDS,
+        )
+    there = count_stored_bytes(session, project_id, with_deleted=True) + new
+    if there > 2 * limit:
+        raise BudgetExceeded(
+            f"with this and what was deleted, the project would fill {there} bytes; at most "
+            f"{2 * limit} are allowed. Deleted bytes are removed after about {REMOVAL_TIME}",
             FULL_RETRY_SECONDS,
         )
 
@@ -159,7 +197,7 @@ def check_daily_evaluations(session: Session, project_id: str, limit: int | None
     if made < limit:
         return
     raise BudgetExceeded(
-        f"{_describe_overrun(made, limit)} Submit this job later, or ask the operator for more "
+        f"{_describe_overrun(made, limit)} Try again later, or ask the operator for more "
         "(`lagid project limit`)",
         _find_seconds_until_free(session, project_id),
     )
@@ -194,19 +232,35 @@ def list_overruns(session: Session) -> list[Overrun]:
 
 
 def _describe_overrun(made: int, limit: int) -> str:
-    return f"the jobs of the last 24 hours made {made} evaluations; {limit} are allowed."
+    return f"the last 24 hours made {made} evaluations; {limit} are allowed."
 
 
-def count_stored_bytes(session: Session, project_id: str) -> int:
-    """Count the bytes of the stored recordings of a project."""
-    query = select(func.sum(Dataset.size_bytes)).where(
-        Dataset.project_id == project_id, Dataset.deleted_at.is_(None)
+def count_stored_bytes(session: Session, project_id: str, *, with_deleted: bool = False) -> int:
+    """Count the bytes of the recordings of a project, and of the results of its runs.
+
+    Open runs count as if they had their results.
+
+    Parameters
+    ----------
+    with_deleted : bool
+        Whether what is deleted counts until it is removed.
+    """
+    shown: ColumnElement[bool] = Dataset.deleted_at.is_(None)
+    kept: ColumnElement[bool] = Job.deleted_at.is_(None)
+    if with_deleted:
+        shown = shown | (Dataset.deleted_at > utc_now() - REMOVAL_TIME)
+        kept = Job.purged_at.is_(None)
+    files = select(Dataset.sha256, Dataset.size_bytes).where(
+        Dataset.project_id == project_id, shown
     )
-    return int(session.scalar(query) or 0)
+    recordings = select(func.sum(files.distinct().subquery().c.size_bytes))
+    n_results = case((Job.state.in_(OPEN_STATES), Job.n_runs), else_=Job.n_done)
+    results = select(func.sum(n_results)).where(Job.project_id == project_id, kept)
+    return int(session.scalar(recordings) or 0) + RESULT_BYTES * int(session.scalar(results) or 0)
 
 
 def _count_daily_evaluations(session: Session, project_id: str) -> int:
-    """Count the evaluations of the jobs that ended in the last 24 hours, and of the open ones.
+    """Count the evaluations of requests, of jobs that ended in the last 24 hours, and of open ones.
 
     Runs that were taken over from other jobs cost nothing: their part of a job does not count.
     """
@@ -216,14 +270,36 @@ def _count_daily_evaluations(session: Session, project_id: str) -> int:
     of_project = Job.project_id == project_id
     ended = select(own).where(of_project, Job.finished_at >= utc_now() - DAY)
     running = select(own).where(of_project, Job.state.in_(OPEN_STATES))
-    return int(session.scalar(ended) or 0) + int(session.scalar(running) or 0)
+    requested = select(func.sum(RequestedWork.evaluations)).where(
+        RequestedWork.project_id == project_id, RequestedWork.hour > utc_now() - DAY
+    )
+    return sum(int(session.scalar(query) or 0) for query in (ended, running, requested))
+
+
+def add_requested_work(session: Session, evaluations: int) -> None:
+    """Add evaluations that a request of the session's project has made to those of the hour."""
+    now = utc_now()
+    of_project = RequestedWork.project_id == find_project(session)
+    key = {
+        "project_id": find_project(session),
+        "hour": now.replace(minute=0, second=0, microsecond=0),
+    }
+    insert_missing(session, RequestedWork, [{**key, "evaluations": 0}])
+    session.execute(
+        update(RequestedWork)
+        .where(of_project, RequestedWork.hour == key["hour"])
+        .values(evaluations=RequestedWork.evaluations + evaluations)
+    )
+    session.execute(delete(RequestedWork).where(of_project, RequestedWork.hour <= now - DAY))
 
 
 def _find_seconds_until_free(session: Session, project_id: str) -> float:
     now = utc_now()
-    first = session.scalar(
-        select(func.min(Job.finished_at)).where(
-            Job.project_id == project_id, Job.finished_at >= now - DAY
-        )
+    jobs = select(func.min(Job.finished_at)).where(
+        Job.project_id == project_id, Job.finished_at >= now - DAY
     )
+    requests = select(func.min(RequestedWork.hour)).where(
+        RequestedWork.project_id == project_id, RequestedWork.hour > now - DAY
+    )
+    first = min(filter(None, (session.scalar(jobs), session.scalar(requests))), default=None)
     return FULL_RETRY_SECONDS if first is None else (first + DAY - now).total_seconds()

@@ -20,7 +20,7 @@ from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from service.core.bodies.text_checks import MANY
-from service.core.states import OPEN_STATES, JobState
+from service.core.states import OPEN_STATES, RUN_STATES, JobState
 from service.repositories.history_rows import (
     HistoryPoint,
     MigrantPoint,
@@ -119,7 +119,7 @@ class RunRepository:
         of_job = filter_job(job_id, self._project_id)
         query = select(Run.state, func.count()).where(*of_job).group_by(Run.state)
         counts = dict(self._session.execute(query).all())
-        return {state: counts.get(state, 0) for state in JobState}
+        return {state: counts.get(state, 0) for state in RUN_STATES}
 
     def count_ended(self, job_id: str) -> int:
         """Count the runs of a job that have ended, deleted ones too."""

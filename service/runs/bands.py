@@ -14,12 +14,12 @@ from sqlalchemy.orm import Session
 from service.core.bodies.user_documents import to_finite
 from service.core.computed import ComputedValues
 from service.core.errors import Conflict, InvalidRequest, NotFound
-from service.core.process.concurrency import simulation_limit
+from service.core.process.concurrency import simulation_places
 from service.jobs.stored_run import StoredRun, load_estimated_run
 from service.runs.profiles import measure_work, read_estimate
 from service.runs.run_schemas import BandExperimentOut, BandOut, BandsOut
 from service.storage.objects import ObjectStore
-from service.storage.sessions import release_connection
+from service.storage.sessions import find_project, release_connection
 from service.storage.storage_errors import ObjectMissing, RowNotFound
 from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
@@ -102,7 +102,7 @@ def _compute_bands(
         theta = read_estimate(problem, stored)
         noise_degrees = float(problem.n_scored - theta.size)
         times = result.correlation_times
-        with simulation_limit.acquire():
+        with simulation_places.hold(find_project(session)):
             whitening = make_whitening(problem, times) if any(times.values()) else None
             uncertainty = analyse_estimate(problem, theta, whitening=whitening).uncertainty
             if uncertainty is None:

@@ -10,11 +10,11 @@ from sqlalchemy.orm import Session
 
 from service.core.computed import ComputedValues
 from service.core.errors import InvalidRequest, NotFound, ServiceBusy
-from service.core.process.concurrency import simulation_limit
+from service.core.process.concurrency import simulation_places
 from service.jobs.stored_run import StoredRun
 from service.runs.profiles import measure_work
 from service.storage.objects import ObjectStore
-from service.storage.sessions import release_connection
+from service.storage.sessions import find_project, release_connection
 from service.storage.storage_errors import ObjectMissing, RowNotFound
 from sysid.core.errors import SysidError
 from sysid.results.result import Result
@@ -52,5 +52,5 @@ def _explain(session: Session, store: ObjectStore, stored: StoredRun, result: Re
     release_connection(session)
     if measure_work(problem) > MAX_WORK:
         return result
-    with simulation_limit.acquire():
+    with simulation_places.hold(find_project(session)):
         return explain_afterwards(problem, result)

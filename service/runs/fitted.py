@@ -7,7 +7,7 @@ from sqlalchemy.orm import Session
 
 from service.core.computed import ComputedValues
 from service.core.errors import Conflict, InvalidRequest, NotFound
-from service.core.process.concurrency import simulation_limit
+from service.core.process.concurrency import simulation_places
 from service.core.states import JobState
 from service.datasets.datasets import to_series
 from service.formats.mcap.mcap_files import (
@@ -18,7 +18,7 @@ from service.formats.mcap.mcap_files import (
 from service.jobs.stored_run import StoredRun, load_run
 from service.runs.run_schemas import ExperimentOut, ResponseOut
 from service.storage.objects import ObjectStore
-from service.storage.sessions import release_connection
+from service.storage.sessions import find_project, release_connection
 from service.storage.storage_errors import ObjectDamaged, ObjectMissing, RowNotFound
 from sysid.core.errors import SysidError, UnreadableFile
 from sysid.data.records import Channel
@@ -72,7 +72,7 @@ def _compute_signals(
     session: Session, store: ObjectStore, stored: StoredRun
 ) -> tuple[FittedOutput, ...]:
     release_connection(session)
-    with simulation_limit.acquire():
+    with simulation_places.hold(find_project(session)):
         try:
             records, signals = stored.resimulate(session, store)
         except (SysidError, NotFound, InvalidRequest, RowNotFound, ObjectMissing) as error:

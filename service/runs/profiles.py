@@ -1,18 +1,20 @@
 """Use case: profile likelihood of a run's parameters, computed on request.
 
 It runs in a thread of the web process, in parallel with other requests. Work that would take too
-long is refused, or stopped when it does. Only one profile is computed at a time.
+long is refused, or stopped when it does. A project has one profile at a time.
 """
 
-from collections.abc import Iterator
-from threading import Lock
+from collections.abc import Callable, Iterator
+from functools import partial
 from time import monotonic
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from service.core.errors import Conflict, InvalidRequest
+from service.core.errors import Conflict, InvalidRequest, ServiceBusy
+from service.core.process.concurrency import FairPlaces
 from service.jobs.stored_run import StoredRun, load_estimated_run
+from service.queue.daily_limit import check_budget, count_evaluations
 from service.runs.run_schemas import ProfileIn, ProfileOut, RunProfilesOut
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
@@ -22,14 +24,12 @@ from sysid.core.types import FloatArray
 if TYPE_CHECKING:
     from sysid.simulation.problem import Problem
 
-
 MAX_WORK = 300_000_000  # `measure_work` × points × profiles
 LIMIT_SECONDS = 45.0  # a client waits a minute
-CHI_SQUARED_95 = (
-    3.841458820694124  # as in sysid.uncertainty.profile_likelihood, which needs a compiler
-)
-
-_profile_lock = Lock()
+CHI_SQUARED_95 = 3.841458820694124
+"""As in `sysid.uncertainty.profile_likelihood`, which needs a compiler."""
+_places = FairPlaces(2, 1, waiting=0, what="profiles")
+"""One profile of a project at a time: each takes a core for up to `LIMIT_SECONDS`."""
 
 
 def compute_profiles(
@@ -60,12 +60,13 @@ def compute_profiles(
             f"{MAX_WORK:.3g}. "
             "Ask for fewer, or use sysid.uncertainty.profile_likelihood.compute_profile",
         )
-    if not _profile_lock.acquire(blocking=False):
-        raise Conflict("another profile is being computed. Ask again when it is done")
+    check_budget(database)
+    count = partial(count_evaluations, database)
     try:
-        profiles = list(_profile_parameters(problem, theta, names, body.points))
-    finally:
-        _profile_lock.release()
+        with _places.hold(database.owner.project_id):
+            profiles = list(_profile_parameters(problem, theta, names, body.points, count))
+    except ServiceBusy:
+        raise Conflict("another profile is being computed. Ask again when it is done") from None
     return RunProfilesOut(id=run_id, threshold=CHI_SQUARED_95, profiles=profiles)
 
 
@@ -81,7 +82,11 @@ def _choose_parameters(problem: "Problem", body: ProfileIn) -> list[str]:
 
 
 def _profile_parameters(
-    problem: "Problem", theta: FloatArray, names: list[str], points: int
+    problem: "Problem",
+    theta: FloatArray,
+    names: list[str],
+    points: int,
+    count: Callable[[int], None],
 ) -> Iterator[ProfileOut]:
     # This imports the compiler, which most requests never need.
     from sysid.uncertainty.profile_likelihood import compute_profile
@@ -89,6 +94,7 @@ def _profile_parameters(
     end = monotonic() + LIMIT_SECONDS
     for name in names:
         profile = compute_profile(problem, theta, name, points, lambda: monotonic() > end)
+        count(profile.evaluations)
         if not profile.is_complete:
             raise InvalidRequest.from_fault(
                 "/parameters",

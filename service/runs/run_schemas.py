@@ -19,7 +19,7 @@ from service.core.bodies.wire import (
     Labels,
     Page,
 )
-from service.core.states import StateName
+from service.core.states import RunStateName
 from service.datasets.dataset_schemas import SeriesOut
 from service.models.model_schemas import ModelDocumentOut
 from sysid.control.linear_form import Covariance, IdentifiedValue
@@ -42,7 +42,7 @@ class RunOut(Answer):
     number: int = Field(description="number in the job, from 0")
     cell: Cell = Field(description="values of the sweep's axes, by their pointers")
     labels: Labels = Field(description="labels of the cell, such as a length")
-    state: StateName = Field(description="state of the run")
+    state: RunStateName = Field(description="state of the run")
     progress: float = Field(description="share that is done, from 0 to 1")
     error: str | None = Field(default=None, description="why the run failed; null if it did not")
     reused_from: str | None = Field(

@@ -13,11 +13,12 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
-from service.core.process.concurrency import simulation_limit
+from service.core.process.concurrency import simulation_places
 from service.datasets.datasets import to_series
 from service.datasets.signal_channels import SignalChannels, map_channels
 from service.datasets.stored_recordings import read_records
 from service.jobs.stored_run import StoredRun, load_estimated_run
+from service.queue.daily_limit import check_budget, count_evaluations
 from service.repositories.dataset_rows import DatasetRepository
 from service.runs.run_schemas import AgreementOut, ExperimentOut, FreeRunIn, FreeRunOut
 from service.storage.objects import ObjectStore
@@ -85,14 +86,17 @@ def validate_run(
     )
 
 
-@simulation_limit.acquire()
 def simulate_free_run(
     database: Database, store: ObjectStore, run_id: str, body: FreeRunIn
 ) -> FreeRun:
     """Simulate as `validate_run` does, but return arrays. Raises the same errors."""
-    with database.read_session() as session:
-        problem, row = _read_problem(session, store, run_id, body)
-    return _evaluate_free_run(problem, run_id, row)
+    check_budget(database)
+    with simulation_places.hold(database.owner.project_id):
+        with database.read_session() as session:
+            problem, row = _read_problem(session, store, run_id, body)
+        free_run = _evaluate_free_run(problem, run_id, row)
+    count_evaluations(database, 1)
+    return free_run
 
 
 def _read_problem(

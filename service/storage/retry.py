@@ -9,6 +9,7 @@ from typing import TypeVar
 from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError
 
 from service.core.process.loop_watch import report_turn
+from sysid.core.awake_clock import read_awake_seconds
 
 _log = logging.getLogger(__name__)
 
@@ -64,13 +65,13 @@ def retry_transient(work: Callable[[], T]) -> T:
     OperationalError, InterfaceError, InternalError
         After `GIVE_UP_SECONDS`.
     """
-    start = time.monotonic()
+    start = read_awake_seconds()
     is_logged = False
     while True:
         try:
             result = work()
         except TRANSIENT_ERRORS as error:
-            if not is_transient(error) or time.monotonic() - start > GIVE_UP_SECONDS:
+            if not is_transient(error) or read_awake_seconds() - start > GIVE_UP_SECONDS:
                 raise
             if not is_logged:
                 _log.warning("the database does not answer: %s", str(error).splitlines()[0])
@@ -79,5 +80,5 @@ def retry_transient(work: Callable[[], T]) -> T:
             time.sleep(PAUSE_SECONDS)
         else:
             if is_logged:
-                _log.info("the database answers again after %.1f s", time.monotonic() - start)
+                _log.info("the database answers again after %.1f s", read_awake_seconds() - start)
             return result

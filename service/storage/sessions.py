@@ -97,6 +97,12 @@ class Database:
         owned._info = {_DATABASE_KEY: owned, _OWNER_KEY: owner}
         return owned
 
+    @property
+    def owner(self) -> SessionOwner:
+        """For whom the sessions of this database work."""
+        owner: SessionOwner = self._info.get(_OWNER_KEY, _DEFAULT_OWNER)
+        return owner
+
     @contextmanager
     def write_session(self, busy_seconds: float | None = None) -> Iterator[Session]:
         """Open a session that commits when its block ends without an error.

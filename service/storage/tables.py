@@ -76,6 +76,16 @@ class Project(Base):
     max_daily_evaluations: Mapped[int | None] = mapped_column(LargeInteger)
 
 
+class RequestedWork(Base):
+    """Evaluations that a web process made for requests of a project within an hour."""
+
+    __tablename__ = "requested_work"
+
+    project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"), primary_key=True)
+    hour: Mapped[datetime] = mapped_column(primary_key=True)
+    evaluations: Mapped[int] = mapped_column(LargeInteger)
+
+
 class ApiKey(Base):
     """A key to a project; only the digest of its secret is stored.
 

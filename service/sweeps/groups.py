@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.core.bodies.job_fields import SIGMA_PATH
-from service.core.states import JobState
+from service.core.states import RUN_STATES, JobState
 from service.jobs.axes import AxisGroup
 from service.jobs.stored_cells import read_axis_groups
 from service.repositories.summary_rows import RunTable, SummaryQuantity
@@ -199,9 +199,9 @@ def aggregate_runs(
     located = groups.locate_runs(table.numbers)
     inside = located >= 0
     succeeded = inside & table.is_in_state(JobState.SUCCEEDED)
-    counts = {
+    counts: dict[JobState, Any] = {
         state: np.bincount(located[inside & table.is_in_state(state)], minlength=n_groups)
-        for state in JobState
+        for state in RUN_STATES
     }
     all_runs = groups.locate_runs(np.arange(groups.n_runs))
     sizes = np.bincount(all_runs[all_runs >= 0], minlength=n_groups)
@@ -214,7 +214,7 @@ def aggregate_runs(
         RunGroup(
             key=key,
             first_number=groups.first_numbers[group],
-            states={state: int(counts[state][group]) for state in JobState},
+            states={state: int(counts[state][group]) for state in RUN_STATES},
             n_valid=int(valid[group]),
             sigma=_choose_sigma(low[group], high[group], groups, group),
             mean_evaluations=_to_optional(evaluations[group]),

@@ -17,7 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from service.core.computed import ComputedValues
-from service.core.states import JobState
+from service.core.states import RUN_STATES, JobState
 from service.queue.leases import Lease, LeaseQueue
 from service.repositories.summary_rows import (
     RunTable,
@@ -108,7 +108,9 @@ def store_summary(database: Database, lease: Lease) -> None:
 
 def _pending(job: Job) -> JobState:
     """Return the state that runs count in that were never created."""
-    return job.state if job.state.is_terminal else JobState.QUEUED
+    if not job.state.is_terminal:
+        return JobState.QUEUED
+    return JobState.SUCCEEDED if job.state is JobState.INCOMPLETE else job.state
 
 
 def _load_or_compute(session: Session, job: Job) -> JobSummary:
@@ -169,7 +171,7 @@ def _to_document(summary: JobSummary) -> Document:
         "quantities": [[quantity.kind, quantity.parameter] for quantity in quantities],
         "groups": [
             {
-                "states": [group.states[state] for state in JobState],
+                "states": [group.states[state] for state in RUN_STATES],
                 "valid": group.n_valid,
                 "sigma": group.sigma,
                 "evaluations": group.mean_evaluations,
@@ -190,7 +192,7 @@ def _from_document(job: Job, document: Document) -> JobSummary:
         RunGroup(
             key=key,
             first_number=first,
-            states=dict(zip(JobState, group["states"], strict=True)),
+            states=dict(zip(RUN_STATES, group["states"], strict=True)),
             n_valid=group["valid"],
             sigma=None if group["sigma"] is None else (group["sigma"][0], group["sigma"][1]),
             mean_evaluations=group["evaluations"],

@@ -44,6 +44,7 @@ _SOURCE_PATTERNS = (
     "uncertainty/local_algebra.py",
     "uncertainty/sensitivities.py",
     "residuals/restricted_likelihood.py",
+    "judgement/decaying_sums.py",
 )
 _VERSIONS = (numba.__version__, llvmlite.__version__, np.__version__, sys.version)
 _LONG_TO_COMPILE = "sysid.islands.evolve"  # its function holds the whole search

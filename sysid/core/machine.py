@@ -1,7 +1,9 @@
-"""Identity of the machine, for names of files that several machines share."""
+"""The machine: its identity, for names of files that several machines share, and its memory."""
 
 import hashlib
+import os
 import socket
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -19,6 +21,14 @@ def read_machine_id() -> str | None:
         return f"{boot} {Path('/proc/self/ns/pid').readlink()}"
     except OSError:
         return None
+
+
+def read_memory_bytes() -> int:
+    """Read the memory that this machine, or the container around this process, has in bytes."""
+    total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    with suppress(OSError, ValueError):  # no such file, or "max"
+        total = min(total, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return total
 
 
 def make_machine_tag() -> str:

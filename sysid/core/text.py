@@ -12,14 +12,15 @@ DASH = "–"
 RELATIVE_UNIT = "σ"
 """Unit of the RMS over several outputs: the standard deviation of each."""
 SETTING = re.compile(
-    r"(?<!\bthe model )\b(?P<field>\w+): "
-    r"\{(?P<entries>[^{}:,]+: [^{}:,]+(?:, [^{}:,]+: [^{}:,]+)*)\}"
+    r"(?<!\bthe model )\b(?P<field>\w+): \{(?:(?<=\bparameters: \{)(?P<part>[^{}:,]+): \{)?"
+    r"(?P<entries>[^{}:,]+: [^{}:,]+(?:, [^{}:,]+: [^{}:,]+)*)\}(?(part)\})"
     r"|\b(?P<name>prediction|initial|skip): "
     r"(?P<value>one-step|simulation|rest|free|measured|auto|\d+)\b"
 )
 """A field of a job in a note, as in a job file: ``loss: {noise_model: ar1}``.
 
-Text after "the model" is excluded: it names a field of the model document, which no option sets.
+Of `parameters` it is one in them: ``parameters: {r: {physical: upper}}``. Text after "the model" is
+excluded: it names a field of the model document, which no option sets.
 """
 _AT_BOUND = "at bound"
 _WITHOUT_ERROR = (_AT_BOUND, "not settled")  # statuses of an estimate
@@ -211,26 +212,27 @@ def append_unit(name: str, symbol: str | None) -> str:
     return f"{name}{bracket_unit(symbol)}"
 
 
-def rewrite_settings(note: str, write: Callable[[str, Mapping[str, str]], str]) -> str:
+def rewrite_settings(note: str, write: Callable[[Sequence[str], Mapping[str, str]], str]) -> str:
     """Rewrite a note so that it names settings as the reader types them, not as a job file does.
 
     Parameters
     ----------
     write : callable
-        Writes a setting from the field, and the names and values in it. The field is empty for a
-        setting of the job itself.
+        Writes a setting from its place, and the names and values there. The place is a field, or
+        ``parameters`` and one of them; it is empty for a setting of the job itself.
 
     Examples
     --------
-    >>> rewrite_settings("use hold: {u: zero}", lambda field, entries: f"{field}={entries}")
+    >>> rewrite_settings("use hold: {u: zero}", lambda place, entries: f"{place[0]}={entries}")
     "use hold={'u': 'zero'}"
     """
 
     def rewrite(match: re.Match[str]) -> str:
         if match["name"]:
-            return write("", {match["name"]: match["value"]})
+            return write((), {match["name"]: match["value"]})
         entries = (entry.split(": ") for entry in match["entries"].split(", "))
-        return write(match["field"], dict(entries))
+        place = [name for name in (match["field"], match["part"]) if name]
+        return write(place, dict(entries))
 
     return SETTING.sub(rewrite, note)
 

@@ -1,11 +1,13 @@
 """Limits of the bounds of a parameter, beyond which values are impossible.
 
-A delay is neither negative nor as long as a record. Divisors and arguments of roots and logarithms
-keep the sign that the bounds imply; a time constant, for example, stays positive.
+A physical limit is not passed. A delay is neither negative nor as long as a record. Divisors and
+arguments of roots and logarithms keep the sign that the bounds imply; a time constant, for example,
+stays positive.
 """
 
 from collections.abc import Callable, Iterator, Mapping
 from math import inf
+from typing import get_args
 
 import numpy as np
 
@@ -14,7 +16,7 @@ from sysid.language.functions import Interval
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, walk
 from sysid.language.value_intervals import bound_expression
 from sysid.models.model_delays import compute_longest_delay, has_known_past, list_past_values
-from sysid.models.parameters import Parameter
+from sysid.models.parameters import BoundSide, Parameter
 from sysid.models.sections import get_interval
 from sysid.models.ties import collect_parameter_names
 from sysid.simulation.problem import Problem
@@ -75,8 +77,8 @@ def find_widest_bounds(problem: Problem, parameter: Parameter) -> Interval:
         return all(compute_longest_delay(problem.model, past, wide, h) < last for h, last in grids)
 
     ends = (
-        _bisect_limit(end, direction * width, is_possible)
-        for end, direction in zip(present, (-1, 1), strict=True)
+        end if parameter.is_physical(side) else _bisect_limit(end, direction * width, is_possible)
+        for side, end, direction in zip(get_args(BoundSide), present, (-1, 1), strict=True)
     )
     low, high = (0.0 if abs(end) < _ZERO_TOLERANCE * width else end for end in ends)
     return low, high

@@ -174,7 +174,9 @@ def _build_identification(
         left, late = budget.count_left(), deadline.is_past_grace
         orders, spent = compare_orders(problem, theta, analysis.estimates, left, late)
         budget.spend(spent)
-    doubts = find_hold_doubts(problem, holds, simulated, best.lowest_end.rms)
+    simulations = Simulations(budget.count_left(), deadline.is_past_grace)
+    doubts = find_hold_doubts(problem, holds, theta, simulated, best.lowest_end.rms, simulations)
+    budget.spend(simulations.spent)
     posterior = None
     if has_posterior:
         others = [minimum.values for minimum in minima.minima if minimum.is_compatible]
@@ -190,10 +192,10 @@ def _build_identification(
         left,
         late,
         has_feedback=bool(feedback),
-        doubtful=[hold for hold, doubt in zip(holds, doubts, strict=True) if doubt],
+        doubtful=[hold for hold, doubt in zip(holds, doubts, strict=True) if doubt.text],
     )
     budget.spend(spent)
-    estimates, rms = analysis.estimates, best.lowest_end.rms
+    estimates = analysis.estimates
     are_noise = is_explained(
         problem,
         metrics.rms,
@@ -208,7 +210,9 @@ def _build_identification(
     yardstick = fit_yardstick(problem, simulated) if measures else None
     if compares_orders and not problem.is_free_run:
         yardstick = _measure_free_run(problem, theta)
-    simulations = Simulations(budget.count_left(), deadline.is_past_grace)
+    # A sweep's run tries no setting: that is done when somebody opens it.
+    left = budget.count_left() if compares_orders else 0
+    simulations = Simulations(left, deadline.is_past_grace)
     explanations = (
         ()
         if feedback
@@ -216,7 +220,7 @@ def _build_identification(
             () if is_of_the_solver else explained.findings,
             [
                 *find_other_orders(orders, problem.model.name, estimates),
-                *find_other_readings(problem, holds, doubts, estimates, rms, simulations),
+                *find_other_readings(problem, holds, doubts, estimates, simulations),
                 *find_open_starts(best.starts, estimates),
             ],
         )

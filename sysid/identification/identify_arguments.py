@@ -87,25 +87,33 @@ def _check_means(record: Record, holds: Mapping[str, HoldSetting]) -> None:
                 raise InvalidSettings(join_pointer("hold", channel.name), str(error)) from None
 
 
-def write_setting(field: str, entries: Mapping[str, str]) -> str:
+def write_setting(place: Sequence[str], entries: Mapping[str, str]) -> str:
     """Write a setting of a job as the argument of `identify` that gives it.
 
     Examples
     --------
-    >>> write_setting("hold", {"u": "first"})
+    >>> write_setting(["hold"], {"u": "first"})
     "hold={'u': 'first'}"
-    >>> write_setting("loss", {"kind": "soft-l1", "scale": "0.3"})
+    >>> write_setting(["loss"], {"kind": "soft-l1", "scale": "0.3"})
     "loss=Loss(kind='soft-l1', scale=0.3)"
-    >>> write_setting("", {"prediction": "one-step"})
+    >>> write_setting([], {"prediction": "one-step"})
     "prediction='one-step'"
+    >>> write_setting(["parameters", "r"], {"physical": "upper"})
+    "parameters={'r': {'physical': 'upper'}}"
     """
     values = {
         name: text if _NUMBER.fullmatch(text) else repr(text) for name, text in entries.items()
     }
     arguments = ", ".join(f"{name}={value}" for name, value in values.items())
-    if field in ("", "loss"):
-        return f"loss=Loss({arguments})" if field else arguments
-    return f"{field}={{{', '.join(f'{name!r}: {value}' for name, value in values.items())}}}"
+    if not place:
+        return arguments
+    field, *parts = place
+    if field == "loss":
+        return f"loss=Loss({arguments})"
+    written = f"{{{', '.join(f'{name!r}: {value}' for name, value in values.items())}}}"
+    for part in parts:
+        written = f"{{{part!r}: {written}}}"
+    return f"{field}={written}"
 
 
 def describe_assignment(assigned: Assignment, records: Sequence[Record]) -> str:

@@ -1,7 +1,8 @@
 """Explain the residuals of a result that was concluded without it, such as that of a sweep's run.
 
 A sweep concludes many runs, of which few are looked at. So their residuals are explained when
-somebody does, from the stored estimate. Then starts are compared too: another one is a finding.
+somebody does, from the stored estimate. Then starts are compared too: another one is a finding. And
+the other reading of an input is tried before it is advised.
 """
 
 from dataclasses import replace
@@ -15,10 +16,11 @@ from sysid.judgement.conclusions import (
     list_warnings,
     order_findings,
 )
+from sysid.judgement.input_hold import find_hold_doubts, find_other_readings
 from sysid.judgement.judge import Explained, explain_residuals, select_explanations
 from sysid.judgement.levels import SOLVER_SHARE
 from sysid.judgement.noise_findings import find_unexplained
-from sysid.judgement.residual_context import ResidualContext
+from sysid.judgement.residual_context import ResidualContext, Simulations
 from sysid.judgement.starts import compare_starts, find_open_starts
 from sysid.results.result import Result
 from sysid.simulation.problem import Problem
@@ -39,13 +41,21 @@ def explain_afterwards(problem: Problem, result: Result) -> Result:
         analysis = analyse_estimate(problem, theta)
         explained = explain_residuals(ResidualContext(problem, theta, analysis))
         starts = compare_starts(problem, theta, problem.settings.initial)
+        holds, simulated, tried = result.input_hold, problem.predict(theta[None])[0], Simulations()
+        doubts = find_hold_doubts(problem, holds, theta, simulated, result.rms, tried)
+        readings = find_other_readings(problem, holds, doubts, result.parameters, tried)
+        advice = {one.brief: one.advice for one in readings}
     if not explained.is_done:
         return result
     tests = result.residual_tests
     has_feedback = any(one.explanation == "feedback" for one in result.findings)
     still = list(find_unexplained(tests, explained, analysis))
     answered = [one for one in find_unexplained(tests, Explained(), analysis) if one not in still]
-    kept = [one for one in result.findings if one not in answered]
+    kept = [
+        replace(one, advice=advice.get(one.brief, one.advice))
+        for one in result.findings
+        if one not in answered
+    ]
     compared = [one for one in kept if one.gain is not None and one.family != "start"]
     compared += find_open_starts(starts, result.parameters)
     findings = order_findings(

@@ -14,8 +14,10 @@ either side, because coloured noise there knows the noise in the block (Burman, 
 Biometrika 81 (1994) 351).
 """
 
+import cmath
 from collections.abc import Sequence
-from math import ceil, log, sqrt
+from itertools import combinations_with_replacement
+from math import ceil, exp, log, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +25,7 @@ from numpy.fft import irfft, rfft
 
 from sysid.core.types import ComplexArray, FloatArray, IntArray
 from sysid.data.records import Channel
+from sysid.judgement.decaying_sums import sum_with_decay
 from sysid.residuals.autocorrelation import ROUNDING_SHARE, pad_length
 
 _MOST_POLES = 4  # for each input
@@ -82,7 +85,8 @@ def simulate_left_out(inputs: Sequence[Sequence[Channel]], samples: Samples) -> 
     grid, every = _place(inputs, samples)
     if not grid.inputs.size:
         return None
-    rows, shapes, sections = _average_rows(every), _list_shapes(grid), list[_Section]()
+    rows, sections = _average_rows(every), list[_Section]()
+    shapes = _list_shapes(grid, rows)
     found, told = list[LeftOut](), np.ones(every.value.size, dtype=np.bool_)
     while (added := _find_section(grid, rows, sections, shapes)) is not None:
         fit = _refine(grid, rows, [*sections, added])
@@ -115,7 +119,7 @@ class _Rows(NamedTuple):
 
 
 class _Grid(NamedTuple):
-    """Inputs (U, E, G) on a regular grid, and their transforms (U, E, F) of a length.
+    """Inputs (U, G, E) on a regular grid, and their transforms (U, F, E) of a length.
 
     They are means over the step before a point, from the first value of their experiment. The
     samples begin at point `first`.
@@ -129,6 +133,11 @@ class _Grid(NamedTuple):
     @property
     def points(self) -> int:
         """G: points of the grid."""
+        return int(self.inputs.shape[1])
+
+    @property
+    def experiments(self) -> int:
+        """E: experiments."""
         return int(self.inputs.shape[2])
 
     @property
@@ -159,15 +168,17 @@ def _place(inputs: Sequence[Sequence[Channel]], samples: Samples) -> tuple[_Grid
     before = float(np.max(starts - known)) / step
     first = int(np.clip(before, 0.0, _LONGEST_DELAY * points))
     edges = starts[:, None] + step * (np.arange(first + points + 1.0) - first - 1.0)
-    means = np.array([list(map(average_input, channels, edges)) for channels in inputs])
-    moves = means - means[:, :, :1]
+    means = np.array(
+        [np.transpose(list(map(average_input, channels, edges))) for channels in inputs]
+    )
+    moves = means - means[:, :1]
     size = ROUNDING_SHARE * np.max(np.abs(means), axis=(1, 2))
     moves = moves[np.max(np.abs(moves), axis=(1, 2)) > size]
     length = pad_length(2 * (first + points))
     position = (samples.times - starts[samples.experiment]) / step + first
     value = samples.values - np.mean(samples.values)
     rows = _Rows(samples.experiment, position, value, np.ones(value.size), samples.block)
-    return _Grid(moves, rfft(moves, length), length, first), rows
+    return _Grid(moves, rfft(moves, length, axis=1), length, first), rows
 
 
 def average_input(channel: Channel, edges: FloatArray) -> FloatArray:
@@ -215,6 +226,15 @@ class _Section(NamedTuple):
         """Number of poles."""
         return self.place.size - 1
 
+    @property
+    def decay(self) -> complex:
+        """Factor of its states per step."""
+        rate = exp(self.place[1])
+        if self.order == 1:
+            return complex(exp(-rate))
+        damping = exp(self.place[2])
+        return cmath.exp(rate * complex(-damping, sqrt(1.0 - damping**2)))
+
     def answer(self, since: FloatArray) -> FloatArray:
         """Compute impulse responses (n, …) of its n states after so many steps; 0 before."""
         after = np.exp(self.place[1]) * np.maximum(since, 0.0)
@@ -226,10 +246,8 @@ class _Section(NamedTuple):
         return np.asarray(np.exp(-damping * after) * waves)
 
     def simulate(self, grid: _Grid) -> FloatArray:
-        """Simulate its states on the grid, (n, E, G), from rest and without delay."""
-        impulses = rfft(self.answer(np.arange(float(grid.points))), grid.length)
-        states = irfft(impulses[:, None] * grid.spectra[self.channel], grid.length)
-        return np.asarray(states[..., : grid.points])
+        """Simulate its states on the grid, (n, G, E), from rest and without delay."""
+        return sum_with_decay(grid.inputs[self.channel], self.decay)
 
     def read(self, grid: _Grid, rows: _Rows) -> FloatArray:
         """Read its columns (n + n E, R): responses, and those to the start of each experiment."""
@@ -237,7 +255,7 @@ class _Section(NamedTuple):
         low = np.clip(np.floor(position).astype(np.int64), 0, grid.points - 2)
         share = np.clip(position - low, 0.0, 1.0)
         states = self.simulate(grid)
-        before, after = states[:, rows.experiment, low], states[:, rows.experiment, low + 1]
+        before, after = states[:, low, rows.experiment], states[:, low + 1, rows.experiment]
         free = self.answer(rows.position - grid.first)[:, None] * _tell_apart(grid, rows)
         return np.vstack([before + share * (after - before), free.reshape(-1, position.size)])
 
@@ -254,7 +272,7 @@ class _Section(NamedTuple):
 
 def _tell_apart(grid: _Grid, rows: _Rows) -> FloatArray:
     """Build the columns (E, R) that are 1 in an experiment."""
-    return np.equal.outer(np.arange(grid.inputs.shape[1]), rows.experiment).astype(np.float64)
+    return np.equal.outer(np.arange(grid.experiments), rows.experiment).astype(np.float64)
 
 
 class _FittedSections(NamedTuple):
@@ -292,9 +310,9 @@ def _invert(gram: FloatArray) -> FloatArray:
 
 def _add_slopes(grid: _Grid, fit: _FittedSections, rows: _Rows, columns: FloatArray) -> FloatArray:
     """Add to the columns (R, P) of a fit its slopes over the places of all sections."""
-    slopes, begin = [], grid.inputs.shape[1]
+    slopes, begin = [], grid.experiments
     for one in fit.sections:
-        own = slice(begin, begin + one.order * (1 + grid.inputs.shape[1]))
+        own = slice(begin, begin + one.order * (1 + grid.experiments))
         for change in _DIFFERENCE * np.eye(one.place.size):
             moved = one._replace(place=one.place + change).read(grid, rows)
             slopes.append((fit.linear[own] @ (moved - columns.T[own])) / _DIFFERENCE)
@@ -332,18 +350,31 @@ def _leave_out(grid: _Grid, fit: _FittedSections, rows: _Rows, every: _Rows) -> 
     columns = _add_slopes(grid, fit, rows, fit.columns)
     inside = _add_slopes(grid, fit, every, _read_columns(grid, fit.sections, every))
     simulated = np.full(every.value.size, np.nan)
+    changes = np.any(np.diff([rows.experiment, rows.block], axis=1) != 0, axis=0)
+    parts = np.split(np.arange(rows.value.size), np.flatnonzero(changes) + 1)
+    begins = [part[0] for part in parts]
+    experiments, blocks = rows.experiment[begins], rows.block[begins]
+    weighted = rows.weight[:, None] * columns
+    grams = np.array([columns[part].T @ weighted[part] for part in parts])
+    rights = np.array([weighted[part].T @ rows.value[part] for part in parts])
     for first in range(0, int(np.max(rows.block)) + 1, 2):
         own = every.block // 2 == first // 2
-        is_near = (rows.block >= max(first - 1, 0)) & (rows.block <= first + 2)
-        seen = ~(is_near & (rows.experiment == every.experiment[own][0]))
-        weighted = rows.weight[seen, None] * columns[seen]
-        inverse = _invert(columns[seen].T @ weighted)
+        is_near = (blocks >= max(first - 1, 0)) & (blocks <= first + 2)
+        seen = ~(is_near & (experiments == every.experiment[own][0]))
+        inverse = _invert(np.sum(grams[seen], axis=0))
         if np.sum((inside[own] @ inverse) * inside[own]) <= np.count_nonzero(own):
-            simulated[own] = inside[own] @ (inverse @ (weighted.T @ rows.value[seen]))
+            simulated[own] = inside[own] @ (inverse @ np.sum(rights[seen], axis=0))
     return simulated
 
 
-def _list_shapes(grid: _Grid) -> list[_Section]:
+class _Shape(NamedTuple):
+    """A section that is tried at all delays, and products (D, n, n) of its n delayed states."""
+
+    section: _Section
+    products: FloatArray
+
+
+def _list_shapes(grid: _Grid, rows: _Rows) -> list[_Shape]:
     """List the sections that are tried at all delays."""
     shapes = [[log(_SLOWEST / grid.points)]]
     shapes += [[rate] for rate in np.arange(grid.slow, log(_FASTEST), _SPACING)]
@@ -351,64 +382,92 @@ def _list_shapes(grid: _Grid) -> list[_Section]:
         rates = np.arange(grid.slow - log(damping), log(_FASTEST), min(2.5 * damping, _SPACING))
         shapes += [[rate, log(damping)] for rate in rates]
     channels = range(grid.inputs.shape[0])
-    return [_Section(channel, np.array([0.0, *shape])) for channel in channels for shape in shapes]
+    sections = [
+        _Section(channel, np.array([0.0, *shape])) for channel in channels for shape in shapes
+    ]
+    [weights] = _spread(grid, rows, rows.weight[None])
+    transform = rfft(weights, grid.length, axis=0)
+    return [_Shape(one, _multiply_delayed(grid, one, transform)) for one in sections]
+
+
+def _spread(grid: _Grid, rows: _Rows, values: FloatArray) -> FloatArray:
+    """Sum values (m, R) of the rows at the points of the grid, (m, G, E)."""
+    place = np.rint(rows.position).astype(np.int64) * grid.experiments + rows.experiment
+    size = grid.points * grid.experiments
+    summed = [np.bincount(place, one, size) for one in values]
+    return np.reshape(summed, (-1, grid.points, grid.experiments))
+
+
+def _correlate(grid: _Grid, signals: ComplexArray, others: ComplexArray, lags: int) -> FloatArray:
+    """Correlate signals with others (…, F, E) that are later by up to so many steps, (…, lags)."""
+    crossed = np.sum(np.conj(signals) * others, axis=-1)
+    return np.asarray(irfft(crossed, grid.length)[..., :lags])
+
+
+def _multiply_delayed(grid: _Grid, section: _Section, weights: ComplexArray) -> FloatArray:
+    """Multiply the states of a section at all delays, weighted, (D, n, n)."""
+    states = section.simulate(grid)
+    n = len(states)
+    products = np.empty((grid.longest_delay + 1, n, n))
+    for i, j in combinations_with_replacement(range(n), 2):
+        transform = rfft(states[i] * states[j], grid.length, axis=0)
+        found = _correlate(grid, transform, weights, len(products))
+        products[:, i, j] = products[:, j, i] = found
+    return products
 
 
 def _find_section(
-    grid: _Grid, rows: _Rows, sections: Sequence[_Section], shapes: Sequence[_Section]
+    grid: _Grid, rows: _Rows, sections: Sequence[_Section], shapes: Sequence[_Shape]
 ) -> _Section | None:
     """Find the section that explains most of what the others leave; None if they are enough.
 
-    All delays are tried by FFT, orthogonal to the columns of the others (orthogonal least squares:
-    Chen, Billings and Luo, Int. J. Control 50 (1989) 1873). A pair has one more parameter than a
-    pole for each of its states, and pays for it by Schwarz's criterion.
+    All delays are tried, orthogonal to the columns of the others (orthogonal least squares: Chen,
+    Billings and Luo, Int. J. Control 50 (1989) 1873). A pair has one more parameter than a pole for
+    each of its states, and pays for it by Schwarz's criterion.
     """
     root = np.sqrt(rows.weight)
     fixed = np.linalg.qr(root[:, None] * _read_columns(grid, sections, rows))[0]
     errors = root * rows.value
     errors = errors - fixed @ (fixed.T @ errors)
-    spread = np.zeros((2 + fixed.shape[1], *grid.inputs.shape[1:]))
-    place = rows.experiment, np.rint(rows.position).astype(np.int64)
-    for target, column in zip(spread, [root, errors, *fixed.T], strict=True):
-        np.add.at(target, place, root * column)
-    targets, squares = rfft(spread, grid.length), float(errors @ errors)
-    best, least = None, np.inf
+    targets = rfft(_spread(grid, rows, root * np.vstack([errors, fixed.T])), grid.length, axis=1)
+    correlations = [
+        np.ascontiguousarray(_correlate(grid, one, targets, grid.points)[:, ::-1].T)
+        for one in grid.spectra
+    ]
+    squares, best, least = float(errors @ errors), None, np.inf
     used = fixed.shape[1] + sum(one.place.size for one in sections)
     has_slow = any(one.place[1] < grid.slow for one in sections)
-    for shape in shapes:
-        poles = sum(one.order for one in sections if one.channel == shape.channel)
-        added = shape.order * (1 + grid.inputs.shape[1]) + shape.place.size
+    for one, products in shapes:
+        poles = sum(other.order for other in sections if other.channel == one.channel)
+        added = one.order * (1 + grid.experiments) + one.place.size
         if (
-            poles + shape.order > _MOST_POLES
-            or (has_slow and shape.place[1] < grid.slow)
+            poles + one.order > _MOST_POLES
+            or (has_slow and one.place[1] < grid.slow)
             or _ROWS_PER_PARAMETER * (used + added) > rows.value.size
         ):
             continue
-        explained = _scan_delays(grid, shape, targets)
+        explained = _scan_delays(one, products, correlations[one.channel])
         delay = int(np.argmax(explained))
         left = max(squares - float(explained[delay]), 1e-12 * squares)
-        cost = rows.value.size * log(left) + 2 * shape.order * log(rows.value.size)
+        cost = rows.value.size * log(left) + 2 * one.order * log(rows.value.size)
         if cost < least:
-            best, least = _Section(shape.channel, np.array([delay, *shape.place[1:]])), cost
+            best, least = _Section(one.channel, np.array([delay, *one.place[1:]])), cost
     return best
 
 
-def _scan_delays(grid: _Grid, shape: _Section, targets: ComplexArray) -> FloatArray:
+def _scan_delays(section: _Section, products: FloatArray, correlations: FloatArray) -> FloatArray:
     """Compute the squares (D,) that a section explains at all delays beside fixed columns.
 
-    `targets` are the transforms of weights, errors and columns on the grid.
+    `correlations` (G, 1 + P) are those of its input with errors and columns, the latest first. A
+    state is a decaying sum of the input, so its correlations are decaying sums of them.
     """
-    states = shape.simulate(grid)
-
-    def correlate(signals: FloatArray, others: ComplexArray) -> FloatArray:
-        crossed = np.sum(np.conj(rfft(signals, grid.length)) * others, axis=-2)
-        return np.asarray(irfft(crossed, grid.length)[..., : grid.longest_delay + 1])
-
-    products = correlate(states[:, None] * states, targets[0])
-    sums = correlate(states[:, None], targets[None, 1:])
-    own, fixed = sums[:, 0], sums[:, 1:]
-    grams = np.moveaxis(products - np.einsum("apd,bpd->abd", fixed, fixed), 2, 0)
-    sizes = np.einsum("aad->a", products) / products.shape[2]
-    grams = grams + 1e-6 * np.diag(np.maximum(sizes, 1e-300))
-    solved = np.linalg.solve(grams, own.T[:, :, None])[:, :, 0]
-    return np.asarray(np.einsum("da,ad->d", solved, own))
+    sums = sum_with_decay(correlations, section.decay, len(products))[:, ::-1]
+    own, fixed = sums[:, :, 0], sums[:, :, 1:].transpose(1, 0, 2)
+    sizes = np.mean(products.diagonal(axis1=1, axis2=2), axis=0)
+    grams = products - fixed @ fixed.transpose(0, 2, 1)
+    grams += 1e-6 * np.diag(np.maximum(sizes, 1e-300))
+    if section.order == 1:
+        return np.asarray(np.square(own[0]) / grams[:, 0, 0])
+    (first, shared), (_, second) = grams.transpose(1, 2, 0)
+    along = second * own[0] ** 2 + first * own[1] ** 2 - 2.0 * shared * own[0] * own[1]
+    return np.asarray(along / (first * second - shared**2))

@@ -1,6 +1,7 @@
 """Determination: what the data do not tell of single parameters, and bounds that hold them."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,7 +10,8 @@ from sysid.core.units import format_unit
 from sysid.identifiability.combinations import IdentifiableCombination
 from sysid.judgement.levels import SEPARABLE
 from sysid.models.kalman_filter import is_noise_parameter
-from sysid.results.findings import Finding, note
+from sysid.models.parameters import BoundSide, Parameter
+from sysid.results.findings import Finding, Severity, note
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.estimates import Estimate, Uncertainty
@@ -28,7 +30,8 @@ def find_undetermined(
     free = [e for e in analysis.estimates if e.is_free and not is_noise_parameter(e.name)]
     known = analysis.uncertainty
     yield from _find_open_noise(analysis.estimates)
-    yield from _find_bounds(analysis, free, delays, are_residuals_noise=are_residuals_noise)
+    yield from _find_bounds(problem, analysis, free, are_residuals_noise=are_residuals_noise)
+    yield from _find_limits(analysis, free, are_residuals_noise=are_residuals_noise)
     yield from _find_unidentifiable(free, () if known is None else known.groups)
     yield from _find_constant_inputs(problem, free)
     if known is not None:
@@ -73,14 +76,14 @@ def find_ambiguous(estimates: Sequence[Estimate]) -> Iterator[Finding]:
 
 
 def _find_bounds(
+    problem: Problem,
     analysis: Analysis,
     free: Sequence[Estimate],
-    delays: set[str],
     *,
     are_residuals_noise: bool,
 ) -> Iterator[Finding]:
-    """Find estimates at a bound; with residuals that are not noise they are no physical limit."""
-    bounded = [one for one in free if one.status == "at bound"]
+    """Find estimates at a bound of the search; it may be why residuals are not noise."""
+    bounded = [one for one in free if one.status == "at bound" and one.name not in analysis.limits]
     active = [one for one in analysis.active_bounds if not is_noise_parameter(one.name)]
     if not bounded and not active:
         return
@@ -90,6 +93,9 @@ def _find_bounds(
     listed = {bound.name for bound in active}
     texts += [_describe_bound(one) for one in bounded if one.name not in listed]
     cures = join_names([bound.advice for bound in active]) if active else ""
+    by_name = {parameter.name: parameter for parameter in problem.free_parameters}
+    settings = [_write_limit(one, by_name[one.name]) for one in free if one.name in names]
+    limits = "it is a physical limit" if len(names) == 1 else "they are physical limits"
     is_serious = bool(active) and not are_residuals_noise
     cause = " The residuals are not noise, which the bound may cause." if is_serious else ""
     yield Finding(
@@ -99,18 +105,58 @@ def _find_bounds(
         f"{join_names(names)} {lies}",
         f"{join_names(texts)}. The best value may be outside, and other estimates follow it."
         f"{cause}",
-        f"To widen: {cures}, unless it is a physical limit."
-        if cures
-        else "Widen the range, unless it is a physical limit.",
+        f"{f'To widen: {cures}. Or' if cures else 'Widen the range, or'} set "
+        f"{join_names(settings)} if {limits}.",
         parameters=tuple(one.name for one in bounded) or tuple(names),
         status="at bound",
     )
 
 
+def _find_limits(
+    analysis: Analysis, free: Sequence[Estimate], *, are_residuals_noise: bool
+) -> Iterator[Finding]:
+    """Find estimates at a physical limit, which is a doubt only where the data pull them over it.
+
+    The likelihood ratio at a limit that holds is no larger than inside (Self and Liang 1987).
+    """
+    severity: Severity = "caution" if are_residuals_noise else "serious"
+    for one in free:
+        if one.name not in analysis.limits:
+            continue
+        if one.status == "at bound":
+            brief = f"the data pull {one.name} over its physical limit"
+            yield Finding(
+                "bound",
+                "identifiability",
+                severity,
+                brief,
+                f"{_describe_bound(one)}, a limit of the quantity, and the data pull it beyond. "
+                "The model lacks something then, or the record is at fault.",
+                parameters=(one.name,),
+                status="at bound",
+            )
+        elif one.status == "identified":
+            text = f"{_describe_bound(one)}, a limit of the quantity"
+            yield replace(note("bound", "identifiability", text), parameters=(one.name,))
+
+
 def _describe_bound(estimate: Estimate) -> str:
-    is_low = estimate.value < 0.5 * (estimate.lower + estimate.upper)
-    side, bound = ("lower", estimate.lower) if is_low else ("upper", estimate.upper)
+    side, bound = _find_bound(estimate)
     return f"{estimate.name} lies at its {side} bound {bound:g}{format_unit(estimate.unit)}"
+
+
+def _find_bound(estimate: Estimate) -> tuple[BoundSide, float]:
+    """Find the nearer bound of an estimate."""
+    is_low = estimate.value < 0.5 * (estimate.lower + estimate.upper)
+    return ("lower", estimate.lower) if is_low else ("upper", estimate.upper)
+
+
+def _write_limit(estimate: Estimate, parameter: Parameter) -> str:
+    """Write the setting that calls a bound a physical limit; one of the data is given with it."""
+    side, bound = _find_bound(estimate)
+    if parameter.follows_data(side):
+        return f"parameters: {{{estimate.name}: {{{side}: {bound:.6g}, physical: {side}}}}}"
+    return f"parameters: {{{estimate.name}: {{physical: {side}}}}}"
 
 
 def _find_unidentifiable(

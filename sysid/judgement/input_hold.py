@@ -9,6 +9,7 @@ Or the samples beside each of its samples say nothing of it, so no line leads th
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from math import log
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,14 +19,17 @@ from sysid.data.records import Channel, Record
 from sysid.judgement.judge import leaves_noise
 from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE, STRONG_ODDS
 from sysid.judgement.residual_context import Simulations
+from sysid.judgement.residual_model import ResidualModel
 from sysid.kernels.signals.past_reads import is_difference
 from sysid.residuals.feedback import find_commands
 from sysid.residuals.residual_tests import list_residual_series
+from sysid.residuals.series import iterate_parts
 from sysid.results.findings import Finding, Move, list_moves, note
 from sysid.results.parts import InputHold
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.sensitivities import compute_sensitivities
 
 _MAX_NAMED = 3  # estimates in one sentence
 _MIN_ROUGH = 50  # samples: fewer may be rough by chance
@@ -92,26 +96,49 @@ def refit_other_holds(
     return tuple(compared), spent
 
 
-def find_hold_doubts(
-    problem: Problem, holds: Sequence[InputHold], simulated: FloatArray, rms: float
-) -> list[str]:
-    """Find for each hold, as a sentence, why the other reading is as likely; empty if it is not.
+class HoldDoubt(NamedTuple):
+    """Why the other reading of an input is as likely; empty if it is not.
 
-    `simulated` (n,) and `rms` are those with the chosen readings.
+    Attributes
+    ----------
+    text : str
+        A sentence without its full stop.
+    gain : float
+        How much lower the criterion is with the other reading.
+    """
+
+    text: str = ""
+    gain: float = 0.0
+
+
+def find_hold_doubts(
+    problem: Problem,
+    holds: Sequence[InputHold],
+    theta: FloatArray,
+    simulated: FloatArray,
+    rms: float,
+    simulations: Simulations,
+) -> list[HoldDoubt]:
+    """Find for each hold why the other reading is as likely.
+
+    A reading whose RMS is clearly smaller is compared under coloured noise, as explanations are.
+    `theta` (D,), `simulated` (n,) and `rms` are those with the chosen readings.
     """
     open_holds = [hold.chosen == "first" and hold.rms_other is not None for hold in holds]
     commands = find_commands(list_residual_series(problem, simulated)) if any(open_holds) else set()
     doubts = []
     for hold, is_open in zip(holds, open_holds, strict=True):
-        evidence, doubt = _compute_evidence(hold, problem.n_scored, rms), ""
-        if evidence > DEFECT_GAIN:
-            doubt = f"That fits better: RMS {hold.rms_other:.4g}, not {rms:.4g}"
-        elif is_open and evidence >= -DEFECT_GAIN:
+        gain, text = _compute_evidence(hold, problem.n_scored, rms), ""
+        if gain > STRONG_ODDS:
+            gain = _compute_gain(problem, hold, theta, simulations, gain)
+        if gain > DEFECT_GAIN:
+            text = f"That fits better: RMS {hold.rms_other:.4g}, not {rms:.4g}"
+        elif is_open and gain >= -DEFECT_GAIN:
             if hold.input in commands:
-                doubt = "The input follows the residuals as a command does, which is held"
+                text = "The input follows the residuals as a command does, which is held"
             elif _is_rough(hold.input, problem.records):
-                doubt = "Its samples do not follow each other, so hardly in straight lines"
-        doubts.append(doubt)
+                text = "Its samples do not follow each other, so hardly in straight lines"
+        doubts.append(HoldDoubt(text, gain))
     return doubts
 
 
@@ -131,9 +158,8 @@ def write_hold(hold: InputHold) -> str:
 def find_other_readings(
     problem: Problem,
     holds: Sequence[InputHold],
-    doubts: Sequence[str],
+    doubts: Sequence[HoldDoubt],
     estimates: Sequence[Estimate],
-    rms: float,
     simulations: Simulations,
 ) -> Iterator[Finding]:
     """Find holds chosen by the data where the other reading is as likely, or moves an estimate.
@@ -142,14 +168,13 @@ def find_other_readings(
     reading is advised if it leaves nothing but noise, as far as simulations allow to tell.
     """
     known = {one.name: one for one in estimates}
-    for hold, doubt in zip(holds, doubts, strict=True):
-        evidence = _compute_evidence(hold, problem.n_scored, rms)
+    for hold, (doubt, gain) in zip(holds, doubts, strict=True):
         moves = list_moves(estimates, hold.estimates_other or {}, {})
         notable = [move for move in moves if abs(move.stderrs) > NOTABLE_MOVE]
         if doubt or (notable and hold.chosen == "zero"):
             other = f"{_READINGS[str(hold.other)]} ({write_hold(hold)})"
             would = _describe_moves(notable, estimates) or "the same estimates"
-            is_likelier = evidence > STRONG_ODDS
+            is_likelier = gain > STRONG_ODDS
             moved = [
                 one.parameter
                 for one in notable
@@ -163,9 +188,9 @@ def find_other_readings(
                 f"input {hold.input!r} {hold.reason}, so it is read {_READINGS[hold.chosen]}. Read "
                 f"{other} it would give {would}.{f' {doubt}.' if doubt else ''}",
                 f"Use {write_hold(hold)}."
-                if evidence > DEFECT_GAIN and _is_cure(problem, hold, simulations)
+                if gain > DEFECT_GAIN and _is_cure(problem, hold, simulations)
                 else "",
-                evidence,
+                gain,
                 moves,
                 tuple(moved) if doubt else (),
             )
@@ -190,6 +215,30 @@ def _describe_moves(moves: Sequence[Move], estimates: Sequence[Estimate]) -> str
         unit = "" if one.unit == "1" else f" {one.unit}"
         texts.append(f"{one.name} = {move.value:.4g}{unit} instead of {one.value:.4g}")
     return ", ".join(texts)
+
+
+def _compute_gain(
+    problem: Problem,
+    hold: InputHold,
+    theta: FloatArray,
+    simulations: Simulations,
+    evidence: float,
+) -> float:
+    """Compute the gain of the other reading, each with coloured noise of its own.
+
+    It is the `evidence` under white noise if no simulations are left.
+    """
+    estimates = hold.estimates_other or {}
+    other = np.array([estimates[name] for name in problem.free_names])
+    criteria = []
+    for read, point in ((problem, theta), (replace_holds(problem, [hold]), other)):
+        if not simulations.allow(2 * theta.size + 1):
+            return evidence
+        slopes = compute_sensitivities(read, point)
+        simulations.spent += slopes.evaluations
+        model = ResidualModel(-slopes.residuals, slopes.columns, list(iterate_parts(read)))
+        criteria.append(model.without.criterion)
+    return float(criteria[0] - criteria[1])
 
 
 def _compute_evidence(hold: InputHold, samples: int, rms: float) -> float:

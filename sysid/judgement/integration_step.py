@@ -31,7 +31,7 @@ from sysid.models.model import MAX_SUBSTEPS, replace_substeps
 from sysid.results.findings import Finding, note
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import to_unit
+from sysid.simulation.scaling import is_at_bounds, to_unit
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale
 from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.intervals import IntegrationError, compose_interval
@@ -112,7 +112,7 @@ def compare_half_step(
                 spent += fit.evaluations
                 left = None if left is None else left - fit.evaluations
         elif np.isfinite(squares):
-            shift = _predict_shift(problem, analysis.estimates, move, columns)
+            shift = _predict_shift(problem, theta, move, columns)
             end = theta + shift * compute_physical_scale(problem, theta)
             left_over = residual + columns @ shift
             end_squares = float(left_over @ left_over)
@@ -259,11 +259,13 @@ def _can_fit(problem: Problem, simulations: int | None) -> bool:
 
 
 def _predict_shift(
-    problem: Problem, estimates: tuple[Estimate, ...], move: FloatArray, columns: FloatArray
+    problem: Problem, theta: FloatArray, move: FloatArray, columns: FloatArray
 ) -> FloatArray:
-    """Predict the shift (D,), in unit coordinates, after a change (n,) of linear outputs."""
-    at_bound = {estimate.name for estimate in estimates if estimate.status == "at bound"}
-    held = np.array([name in at_bound for name in problem.free_names])
+    """Predict the shift (D,), in unit coordinates, after a change (n,) of linear outputs.
+
+    What lies at a bound stays there.
+    """
+    held = np.logical_or(*is_at_bounds(to_unit(problem.evaluator, theta[None])[0]))
     return np.asarray(-np.linalg.lstsq(columns * ~held, move, rcond=RANK_TOLERANCE)[0])
 
 

@@ -48,15 +48,19 @@ from sysid.simulation.problem import Problem
 from sysid.simulation.start_values import convert_point
 from sysid.uncertainty.analysis import analyse_estimate
 
-_FREE_PROPOSERS = (constancy.propose, sensor.propose)
-_PROPOSERS = (
-    *_FREE_PROPOSERS,
+_Proposer = Callable[[ResidualContext], Iterator[Candidate]]
+_FREE_PROPOSERS: tuple[_Proposer, ...] = (constancy.propose, sensor.propose)
+_CHEAP_PROPOSERS: tuple[_Proposer, ...] = (
     structure.propose,
     history.propose,
     reading.propose,
     other_input.propose,
 )
-_COSTLY_PROPOSERS = (actuator.propose, actuator.propose_loads, switches.propose)
+_COSTLY_PROPOSERS: tuple[_Proposer, ...] = (
+    actuator.propose,
+    actuator.propose_loads,
+    switches.propose,
+)
 """Each of their explanations takes a simulation: only if the residuals depend on anything."""
 _AGAINST_DEFECTS = DEFECT_GAIN - STRONG_ODDS  # a record in twenty has one
 _LIKELY = 0.01  # of the ratio of one candidate: then the costly ones are looked at as well
@@ -127,30 +131,33 @@ def explain_residuals(context: ResidualContext) -> Explained:
         return Explained(is_doubtful=context.simulations.is_cut_short)
     if context.is_of_the_solver:
         return Explained(is_done=True, is_doubtful=True, is_of_the_solver=True)
-    return _explain(context, _score_at_once(context), advises=True)
+    scored = _score_at_once(context, (*_FREE_PROPOSERS, *_CHEAP_PROPOSERS))
+    return _explain(context, scored, advises=True)
 
 
 def explain_if_noise(context: ResidualContext) -> Explained:
     """Explain the residuals as far as it takes to tell whether nothing but noise is left.
 
-    If an explanation that takes no simulation has strong odds and moves an estimate, it is not
-    done: the others would have to explain more and move nothing. No setting is advised.
+    If an explanation that takes few simulations or none has strong odds and moves an estimate, it
+    is not done: the others would have to explain more and move nothing. No setting is advised.
     """
     if not _is_possible(context):
         return Explained()
-    scored = _score_at_once(context)
-    is_likely = bool(scored) and scored[0].gain > STRONG_ODDS
-    if is_likely and _describe(context, scored[0], None, ()).parameters:
-        criterion = context.residual_model.without.criterion
-        odds = scored[0].gain - _AGAINST_DEFECTS
-        return Explained(is_doubtful=True, criterion=criterion, odds=odds)
+    scored = list[_Scored]()
+    for proposers in (_FREE_PROPOSERS, _CHEAP_PROPOSERS):
+        scored = _order([*scored, *_score_at_once(context, proposers)])
+        is_likely = bool(scored) and scored[0].gain > STRONG_ODDS
+        if is_likely and _describe(context, scored[0], None, ()).parameters:
+            criterion = context.residual_model.without.criterion
+            odds = scored[0].gain - _AGAINST_DEFECTS
+            return Explained(is_doubtful=True, criterion=criterion, odds=odds)
     return _explain(context, scored, advises=False)
 
 
-def _score_at_once(context: ResidualContext) -> list[_Scored]:
+def _score_at_once(context: ResidualContext, proposers: Sequence[_Proposer]) -> list[_Scored]:
     """Score the explanations that take few simulations or none."""
     criterion = context.residual_model.without.criterion
-    return _score(context, list(_list_candidates(context, _PROPOSERS)), criterion)
+    return _score(context, list(_list_candidates(context, proposers)), criterion)
 
 
 def _explain(context: ResidualContext, scored: list[_Scored], *, advises: bool) -> Explained:
@@ -236,7 +243,7 @@ def _is_likely(scored: _Scored, samples: int) -> bool:
 
 
 def _list_candidates(
-    context: ResidualContext, proposers: Sequence[Callable[[ResidualContext], Iterator[Candidate]]]
+    context: ResidualContext, proposers: Sequence[_Proposer]
 ) -> Iterator[Candidate]:
     for propose in proposers:
         for candidate in propose(context):

@@ -169,9 +169,10 @@ def _multiply(shared: FloatArray, added: FloatArray, most: int, head: FloatArray
         one[:, s:, s:] = added[:, :, late] @ added[:, :, early].transpose(0, 2, 1)
         products[:, lag, 0] = one.transpose(0, 2, 1)
     tail = _join(shared[:, n - most :], added[:, :, n - most :])
+    entering, leaving = head[:, ::-1], tail[:, ::-1]
     for i in range(most):
-        for j in range(most):
-            entering = head[:, most - 1 - i, :, None] * head[:, most - 1 - j, None, :]
-            leaving = tail[:, most - 1 - i, :, None] * tail[:, most - 1 - j, None, :]
-            products[:, i + 1, j + 1] = products[:, i, j] + entering - leaving
+        one = products[:, i + 1, 1:]
+        np.multiply(entering[:, i, None, :, None], entering[:, :, None, :], out=one)
+        one -= leaving[:, i, None, :, None] * leaving[:, :, None, :]
+        one += products[:, i, :-1]
     return products

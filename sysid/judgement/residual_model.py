@@ -215,7 +215,7 @@ class ResidualModel:
 
 def _measure_lengths(columns: FloatArray) -> FloatArray:
     """Measure the lengths of columns (…, n); 1 of a column of zeros."""
-    lengths = np.linalg.norm(columns, axis=-1)
+    lengths = np.sqrt(np.einsum("...n,...n->...", columns, columns))
     return np.where(lengths > 0, lengths, 1.0)
 
 
@@ -246,7 +246,11 @@ def _solve(products: FloatArray) -> FloatArray:
 def _invert_diagonal(products: FloatArray) -> FloatArray:
     """Compute the diagonals (B, k) of the inverses of normal equations (B, k, k)."""
     scale = _compute_lengths(products)
-    inverse = np.linalg.pinv(_add_ridge(products, scale), hermitian=True)
+    matrices = _add_ridge(products, scale)
+    try:
+        inverse = np.linalg.inv(matrices)
+    except np.linalg.LinAlgError:  # columns that rounding makes equal
+        inverse = np.linalg.pinv(matrices, hermitian=True)
     return np.asarray(np.diagonal(inverse, axis1=1, axis2=2) / scale**2)
 
 

@@ -130,6 +130,8 @@ def _write_parameter(parameter: Parameter, declared: Mapping[str, Any]) -> dict[
         entry["bounds"] = parameter.bounds
     if parameter.tied is not None:
         entry["tied"] = _write_text(parameter.tied)
+    if parameter.physical is not None:
+        entry["physical"] = parameter.physical
     if description := declared[parameter.name].get("description"):
         entry["description"] = " ".join(description.split())
     return entry

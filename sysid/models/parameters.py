@@ -4,13 +4,15 @@ import re
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, replace
 from math import isfinite
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from sysid.core.errors import InvalidBounds, InvalidSettings, suggest_name
 from sysid.core.units import is_blank_unit
 
 ParameterScale = Literal["linear", "log"]
 BoundsRule = Literal["gain", "rate", "offset", "time", "delay", "state"]
+BoundSide = Literal["lower", "upper"]
+PhysicalBounds = Literal["lower", "upper", "both"]
 RATE_UNIT = "1/s"
 """Unit of an integral gain between two signals without units."""
 
@@ -39,6 +41,9 @@ class Parameter:
     bounds : str or None
         What the parameter is, if its bounds follow the data; `lower` and `upper` are then those
         without data.
+    physical : {"lower", "upper", "both"} or None
+        Bounds that are limits of the quantity by its nature or definition, as 1 of a ratio of the
+        smaller to the larger. Without it a bound is one of the search.
 
     Raises
     ------
@@ -60,6 +65,7 @@ class Parameter:
     fixed: float | None = None
     tied: str | None = None
     bounds: BoundsRule | None = None
+    physical: PhysicalBounds | None = None
 
     def __post_init__(self) -> None:
         if not (isfinite(self.lower) and isfinite(self.upper) and self.lower < self.upper):
@@ -75,6 +81,14 @@ class Parameter:
         """Whether the parameter is searched."""
         return self.fixed is None and self.tied is None
 
+    def is_physical(self, side: BoundSide) -> bool:
+        """Whether the bound on that side is a limit of the quantity itself."""
+        return self.physical in (side, "both")
+
+    def follows_data(self, side: BoundSide) -> bool:
+        """Whether the bound on that side is that of the data; a delay is never below 0."""
+        return self.bounds is not None and (self.bounds, side) != ("delay", "lower")
+
     @property
     def has_unit_of_data(self) -> bool:
         """Whether the unit is that of the channels: the model says what it is, but no unit."""
@@ -83,15 +97,18 @@ class Parameter:
         return self.bounds in ("gain", "offset", "state") and is_blank_unit(self.unit)
 
 
-_CHANGEABLE_FIELDS = ("lower", "upper", "scale", "fixed", "tied")
+_CHANGEABLE_FIELDS = ("lower", "upper", "scale", "fixed", "tied", "physical")
+_WORDS = {"scale": get_args(ParameterScale), "physical": get_args(PhysicalBounds)}
+_SIDES: tuple[BoundSide, ...] = get_args(BoundSide)
 
 
 def override_parameters(
     parameters: tuple[Parameter, ...], changes: Mapping[str, Mapping[str, Any]]
 ) -> tuple[Parameter, ...]:
-    """Replace bounds, scales, fixed values or ties of some parameters.
+    """Replace bounds, scales, fixed values, ties or physical limits of some parameters.
 
-    A change of both bounds frees a parameter that its model fixes or ties.
+    A change of both bounds frees a parameter that its model fixes or ties. A bound that is changed
+    is no physical limit any more, unless the change says so.
 
     Raises
     ------
@@ -143,9 +160,10 @@ def _check_field(pointer: str, field: str, value: object) -> None:
     if field == "tied":
         if not isinstance(value, str):
             raise InvalidSettings(pointer, f"{value!r} is not an expression, such as '2*a'")
-    elif field == "scale":
-        if value not in ("linear", "log"):
-            raise InvalidSettings(pointer, f"{value!r} is not 'linear' or 'log'")
+    elif field in _WORDS:
+        if value not in _WORDS[field]:
+            *others, last = map(repr, _WORDS[field])
+            raise InvalidSettings(pointer, f"{value!r} is not {', '.join(others)} or {last}")
     elif isinstance(value, bool) or not isinstance(value, int | float):
         raise InvalidSettings(pointer, f"{value!r} is not a number")
 
@@ -153,7 +171,7 @@ def _check_field(pointer: str, field: str, value: object) -> None:
 def _change_parameter(parameter: Parameter, fields: Mapping[str, Any]) -> Parameter:
     if "tied" in fields:
         return replace(parameter, tied=fields["tied"], fixed=None)
-    values: dict[str, Any] = {k: v if k == "scale" else float(v) for k, v in fields.items()}
+    values: dict[str, Any] = {k: v if k in _WORDS else float(v) for k, v in fields.items()}
     if {"lower", "upper"} <= values.keys() and "fixed" not in values:
         values |= {"fixed": None, "tied": None}  # an interval to search frees the parameter
     fixed = values.get("fixed")
@@ -168,7 +186,33 @@ def _change_parameter(parameter: Parameter, fields: Mapping[str, Any]) -> Parame
             f"{fixed:g} lies outside the bounds [{lower:g}, {upper:g}] of {parameter.name!r}; give "
             "a value inside them, or wider 'lower' and 'upper'",
         )
+    if "physical" in fields:
+        _check_limits(parameter, fields)
+    else:
+        values["physical"] = _keep_limits(parameter, {"lower": lower, "upper": upper})
     return replace(parameter, **values)
+
+
+def _check_limits(parameter: Parameter, fields: Mapping[str, Any]) -> None:
+    """Check that no bound of the data is called a physical limit."""
+    for side in _SIDES:
+        is_said = fields["physical"] in (side, "both")
+        if is_said and side not in fields and parameter.follows_data(side):
+            raise InvalidSettings(
+                f"/parameters/{parameter.name}/physical",
+                f"the {side} bound of {parameter.name!r} follows the data, so it is no physical "
+                f"limit; give {side!r} as well",
+            )
+
+
+def _keep_limits(parameter: Parameter, bounds: Mapping[BoundSide, float]) -> PhysicalBounds | None:
+    """Keep the physical limits among bounds that have not changed."""
+    kept = [
+        side
+        for side in _SIDES
+        if parameter.is_physical(side) and bounds[side] == getattr(parameter, side)
+    ]
+    return "both" if len(kept) > 1 else kept[0] if kept else None
 
 
 def _move_other_bounds(parameter: Parameter, given: dict[str, Any]) -> dict[str, Any]:

@@ -25,7 +25,13 @@ from sysid.models.model import (
     Solver,
     SolverMethod,
 )
-from sysid.models.parameters import BoundsRule, Parameter, ParameterScale
+from sysid.models.parameters import (
+    BoundSide,
+    BoundsRule,
+    Parameter,
+    ParameterScale,
+    PhysicalBounds,
+)
 
 STEADY = "steady"
 """A start at which the equations rest with the inputs' first values."""
@@ -51,6 +57,7 @@ _PARAMETER_FIELDS = (
     "scale",
     "fixed",
     "tied",
+    "physical",
     "description",
 )
 _NEED_START = (
@@ -125,15 +132,30 @@ def _read_parameter(reader: DocumentReader, name: str, entry: object) -> Paramet
             pointer + "/tied", "a parameter is either fixed or tied; leave one of them out"
         )
     bounds = _read_bounds_rule(reader, fields, pointer)
+    physical = _read_physical_bounds(reader, fields, pointer)
     if reader.count_faults() > faults_before:
         return None
     try:
-        return Parameter(
-            name, unit=unit, scale=cast(ParameterScale, scale), tied=tied, bounds=bounds, **numbers
+        parameter = Parameter(
+            name,
+            unit=unit,
+            scale=cast(ParameterScale, scale),
+            tied=tied,
+            bounds=bounds,
+            physical=physical,
+            **numbers,
         )
     except InvalidBounds as error:
         reader.add_fault(pointer, str(error))
         return None
+    for side in get_args(BoundSide):
+        if parameter.is_physical(side) and parameter.follows_data(side):
+            reader.add_fault(
+                pointer + "/physical",
+                f"the {side} bound follows the data, so it is no physical limit; leave out "
+                "'bounds' or 'physical'",
+            )
+    return parameter
 
 
 def _read_bounds_rule(
@@ -144,6 +166,16 @@ def _read_bounds_rule(
         return None
     rule = reader.read_choice(fields["bounds"], get_args(BoundsRule), pointer + "/bounds")
     return cast(BoundsRule, rule)
+
+
+def _read_physical_bounds(
+    reader: DocumentReader, fields: Mapping[str, Any], pointer: str
+) -> PhysicalBounds | None:
+    """Read which bounds are limits of the quantity itself."""
+    if fields.get("physical") is None:
+        return None
+    sides = reader.read_choice(fields["physical"], get_args(PhysicalBounds), pointer + "/physical")
+    return cast(PhysicalBounds, sides)
 
 
 def get_interval(parameter: Parameter) -> tuple[float, float]:

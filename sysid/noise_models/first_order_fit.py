@@ -4,6 +4,8 @@ Models that are compared by their likelihoods have each a noise of their own. Th
 turn: the parameters under a noise, and the noise to the residuals (Cochrane and Orcutt 1949).
 """
 
+from collections.abc import Callable
+from math import exp, inf, isfinite, log
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +19,8 @@ from sysid.simulation.scaling import from_unit, to_unit
 from sysid.uncertainty.analysis import compute_criteria
 
 _ROUNDS = 2  # of least squares and correlation time, in turn
+_GOLDEN_SHARE = 0.6180339887498949
+_BRACKET = 0.05  # of a logarithm, within which the criterion is a parabola
 _SHORTEST_TIME, _LONGEST_TIME = 0.1, 0.5  # correlation time, of a sampling period and the record
 
 
@@ -48,8 +52,6 @@ def fit_correlation_times(problem: Problem, residuals: FloatArray) -> Whitening:
 
     Each output has a correlation time of its own; they are found one after the other.
     """
-    from scipy.optimize import minimize_scalar  # imported late: slow to load, rarely needed
-
     times: dict[str, float] = {}
     for output in problem.model.outputs:
         # Pooled repeats have several samples at a time.
@@ -64,9 +66,26 @@ def fit_correlation_times(problem: Problem, residuals: FloatArray) -> Whitening:
             whitening = make_whitening(problem, {**times, name: float(np.exp(logarithm))})
             return compute_criteria(problem, whitening.whiten(residuals), whitening).bic
 
-        bounds = (np.log(_SHORTEST_TIME * shortest), np.log(_LONGEST_TIME * longest))
-        best = minimize_scalar(
-            compute_bic, bounds=bounds, method="bounded", options={"xatol": 0.01}
-        )
-        times[output.name] = float(np.exp(best.x))
+        limits = log(_SHORTEST_TIME * shortest), log(_LONGEST_TIME * longest)
+        times[output.name] = exp(find_minimum(compute_bic, *limits))
     return make_whitening(problem, times)
+
+
+def find_minimum(function: Callable[[float], float], lower: float, upper: float) -> float:
+    """Find a minimum in an interval by golden sections, and at last by a parabola.
+
+    The method of Brent (Algorithms for Minimization without Derivatives, 1973, ch. 5) does both in
+    turn. SciPy has it, but takes a tenth of a second to load.
+    """
+    points = [(lower, inf), (upper, inf)]
+    inside = lower + _GOLDEN_SHARE * (upper - lower)
+    while len(points) < 3 or points[-1][0] - points[0][0] > _BRACKET:
+        points = sorted([*points, (inside, function(inside))])
+        if len(points) > 3:
+            points = points[:3] if points[1][1] <= points[2][1] else points[1:]
+        inside = points[0][0] + points[2][0] - points[1][0]
+    (before, _), (middle, least), (after, _) = points
+    first, last = ((value - least) / (at - middle) for at, value in (points[0], points[2]))
+    if not (isfinite(first) and isfinite(last) and last > first):
+        return middle  # at an end, or where all is alike
+    return middle - 0.5 * (first * (after - middle) - last * (before - middle)) / (last - first)

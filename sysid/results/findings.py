@@ -83,7 +83,7 @@ class Finding:
     moves : tuple of Move
         What each parameter would be, the furthest move first.
     parameters : tuple of str
-        Parameters that it makes doubtful.
+        Parameters that it makes doubtful; those that a note is about.
     status : EstimateStatus
         Status that these have then.
     reason : str

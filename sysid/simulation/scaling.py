@@ -1,9 +1,13 @@
 """Conversion of parameters to and from the unit interval."""
 
+from collections.abc import Sequence
+from typing import get_args
+
 import numpy as np
 
 from sysid.core.types import BoolArray, FloatArray
 from sysid.kernels.borrowing import compile_borrowing
+from sysid.models.parameters import BoundSide, Parameter
 from sysid.simulation.evaluator import Evaluator
 
 
@@ -39,6 +43,18 @@ def to_unit(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
 
 AT_BOUND = 1e-6
 """Share of the interval: an estimate nearer to a bound counts as at the bound."""
+
+
+def is_at_limits(parameters: Sequence[Parameter], point: FloatArray) -> BoolArray:
+    """Return which coordinates (D,) in [0, 1] are at a bound that is a physical limit."""
+    is_at = np.array(is_at_bounds(point))
+    return np.asarray(np.any(is_at & find_physical_bounds(parameters), axis=0))
+
+
+def find_physical_bounds(parameters: Sequence[Parameter]) -> BoolArray:
+    """Find which bounds (2, D), the lower and the upper ones, are physical limits."""
+    sides = get_args(BoundSide)
+    return np.array([[one.is_physical(side) for one in parameters] for side in sides])
 
 
 def is_at_bounds(points: FloatArray) -> tuple[BoolArray, BoolArray]:

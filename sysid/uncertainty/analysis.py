@@ -48,7 +48,7 @@ from sysid.residuals.series import iterate_parts
 from sysid.residuals.whitening import Whitening
 from sysid.simulation.loss import compute_influence, compute_loss_weight
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import is_at_bounds, to_unit
+from sysid.simulation.scaling import is_at_bounds, is_at_limits, to_unit
 from sysid.uncertainty.estimates import (
     Criteria,
     Estimate,
@@ -93,6 +93,8 @@ class Analysis:
     criteria: Criteria
     active_bounds: tuple[ActiveBound, ...] = ()
     """Bounds to widen together, the costliest first."""
+    limits: frozenset[str] = frozenset()
+    """Parameters at a bound that is a physical limit."""
     linear_model: LinearOutputModel | None = None
     """None if there is no uncertainty, or if the loss is not that of squares."""
     exchanges: ExchangeGroups = ()
@@ -224,8 +226,9 @@ def _analyse_sensitivities(
         degrees=float(np.min(degrees)),
     )
     combined = {name for group in uncertainty.groups for name in group.members}
+    is_limited = is_at_limits(problem.free_parameters, point)
     statuses = _classify_parameters(
-        point, blocks, is_pulled, np.array([name in combined for name in names])
+        point, blocks, is_pulled, np.array([name in combined for name in names]), is_limited
     )
     quantiles = np.array([student_limit(each, 0.025) for each in degrees.tolist()])
     statistics = LocalStatistics(
@@ -237,6 +240,7 @@ def _analyse_sensitivities(
         uncertainty.groups,
         rows[~retained],
         scale,
+        is_limited,
     )
     estimates = _correct_for_jumps(
         problem, make_estimates(problem, statistics), one_sided, plateau_offset * scale
@@ -256,6 +260,7 @@ def _analyse_sensitivities(
         count,
         criteria,
         active_bounds,
+        frozenset(name for name, is_it in zip(names, is_limited, strict=True) if is_it),
         linear,
         decomposition=decomposition,
         likelihood=LikelihoodModel(
@@ -427,16 +432,20 @@ def _classify_parameters(
     blocks: tuple[ParameterBlock, ...],
     is_pulled: BoolArray,
     is_combined: BoolArray,
+    is_limited: BoolArray,
 ) -> tuple[EstimateStatus, ...]:
     """Classify each parameter: see `EstimateStatus`.
 
     `is_combined` (D,) marks parameters in a combination. An unidentified parameter in none is
     unidentifiable by itself. If the data pull a parameter beyond its bound, they contain
     information about it, even if the bound leaves large residuals and standard errors.
+
+    A physical limit (`is_limited`) is as good a value as those inside: no better one lies beyond.
+    If the data pull a parameter over it, that value is theirs no more than at any other bound.
     """
     statuses: list[EstimateStatus] = ["identified"] * point.size
     for d in np.flatnonzero(np.logical_or(*is_at_bounds(point))):
-        statuses[d] = "at bound"
+        statuses[d] = "identified" if is_limited[d] and not is_pulled[d] else "at bound"
     for block in blocks:
         for d in block.members:
             if not is_pulled[d]:
@@ -467,6 +476,7 @@ def _make_estimates_without_stderr(
         (),
         np.eye(d),
         np.ones(d),
+        np.zeros(d, dtype=np.bool_),
         reason,
     )
     return make_estimates(problem, statistics)

@@ -9,6 +9,8 @@ from sysid.identifiability.combinations import IdentifiableCombination
 
 NoiseColour = Literal["white", "first-order", "coloured", "drifting", "clustered"]
 IntervalEnd = Literal["lower", "upper"]
+AT_LIMIT = "it lies at its bound, a limit of the quantity"
+"""Reason of an estimate that the data determine, and that a physical limit ends."""
 EstimateStatus = Literal[
     "identified",
     "not settled",

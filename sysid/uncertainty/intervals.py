@@ -33,10 +33,11 @@ from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.language.functions import Interval
 from sysid.models.parameters import Parameter
-from sysid.uncertainty.estimates import Estimate, EstimateStatus, IntervalEnd
+from sysid.uncertainty.estimates import AT_LIMIT, Estimate, EstimateStatus, IntervalEnd
 
 _TAIL = 0.025  # of the distribution, beyond each end of an interval
 _POOR_SHARE = 1 / 3  # of a range: an interval around 0 that covers more says little
+_ROUNDING = 1e-9  # of a range: an interval that is as wide
 _ENDS: tuple[IntervalEnd, ...] = get_args(IntervalEnd)
 _HALVINGS = 60  # of the range of a quantile: to the resolution of a number
 
@@ -188,12 +189,15 @@ class ProfileEnds:
         Whether the data end it on both sides.
     is_set : bool
         Whether values around the estimate all give the same output.
+    meets_limit : bool
+        Whether a parameter is at a physical limit where an end is.
     """
 
     interval: Interval
     limits: Mapping[IntervalEnd, str] = field(default_factory=dict)
     is_closed: bool = True
     is_set: bool = False
+    meets_limit: bool = False
 
     def apply(self, estimate: Estimate) -> Estimate:
         """Replace the interval, and the status if that of the linear model does not hold.
@@ -201,14 +205,20 @@ class ProfileEnds:
         A parameter is practically identifiable if its profile is closed, and not if an end is open
         (Raue et al., Bioinformatics 25 (2009) 1923). If that end is towards 0, it is still known
         how large the parameter may be, as of any interval that holds 0.
+
+        A physical limit may be a mirror, as 1 is for the ratio of two time constants: beyond it the
+        same outputs come again. There the slopes along a direction vanish, and the linear model
+        sees a combination alone. A profile that is closed shows that there is none.
         """
         found = replace(estimate, interval95=self.interval, open_ends=tuple(self.limits))
-        is_flat = self.is_closed and estimate.status == "unidentifiable"
+        is_mirrored = self.meets_limit and estimate.status == "group"
+        is_flat = self.is_closed and (estimate.status == "unidentifiable" or is_mirrored)
         if self.is_set or is_flat:  # in the worst case all values are as likely
             stderr = (self.interval[1] - self.interval[0]) / sqrt(12.0)
             found = replace(found, stderr=stderr)
         if is_flat:
-            found = replace(found, status="identified", reason="")
+            reason = AT_LIMIT if estimate.value in self.interval else ""
+            found = replace(found, status="identified", reason=reason)
         if found.status != "identified":
             return found
         if self.limits:
@@ -346,7 +356,8 @@ def mark_poor_intervals(
 ) -> tuple[Estimate, ...]:
     """Mark the identified estimates whose 95 % interval says little more than their bounds.
 
-    It is wider than the range, or it contains 0 and more than a third of the range.
+    It is wider than the range, or it contains 0 and more than a third of the range. What lies
+    beyond a physical limit does not count.
     """
     by_name = {parameter.name: parameter for parameter in parameters}
     marked = []
@@ -379,8 +390,12 @@ def _keep_in_bounds(estimate: Estimate) -> Estimate:
 def _explain_poor_interval(parameter: Parameter, interval: Interval) -> str:
     """Explain how an interval says too little; empty if it says enough."""
     lower, upper = parameter.lower, parameter.upper
+    interval = (
+        max(interval[0], lower) if parameter.is_physical("lower") else interval[0],
+        min(interval[1], upper) if parameter.is_physical("upper") else interval[1],
+    )
     poorly = "these data determine it poorly: its 95 % interval"
-    if interval[1] - interval[0] >= upper - lower:
+    if interval[1] - interval[0] >= (1.0 - _ROUNDING) * (upper - lower):
         return f"{poorly} is wider than its range"
     low, high = max(interval[0], lower), min(interval[1], upper)
     if parameter.scale == "log":

@@ -11,7 +11,7 @@ from sysid.language.evaluation import evaluate_expression
 from sysid.language.tree import Expression
 from sysid.models.parameters import Parameter
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.estimates import Estimate, EstimateStatus
+from sysid.uncertainty.estimates import AT_LIMIT, Estimate, EstimateStatus
 from sysid.uncertainty.intervals import LocalInterval, compose_interval
 
 _TIE_STEP = 1e-6  # of the range: slopes of ties
@@ -38,6 +38,8 @@ class LocalStatistics:
         Directions without effect, in unit coordinates p.
     scale : FloatArray, shape (D,)
         ∂θ/∂p.
+    is_limited : BoolArray, shape (D,)
+        Parameters at a physical limit.
     reason : str
         Why no parameter has a standard error; empty if some have one.
     """
@@ -50,6 +52,7 @@ class LocalStatistics:
     groups: tuple[IdentifiableCombination, ...]
     null_directions: FloatArray
     scale: FloatArray
+    is_limited: BoolArray
     reason: str = ""
 
 
@@ -68,7 +71,11 @@ def _make_free_estimate(parameter: Parameter, statistics: LocalStatistics, d: in
     value, status = float(statistics.theta[d]), statistics.statuses[d]
     lacks_stderr = bool(statistics.lacks_stderr[d])
     reason = statistics.reason or _explain_status(
-        parameter.name, status, lacks_stderr, statistics.groups
+        parameter.name,
+        status,
+        lacks_stderr,
+        statistics.groups,
+        is_limited=bool(statistics.is_limited[d]),
     )
     error = None if lacks_stderr else sqrt(max(float(statistics.covariance[d, d]), 0.0))
     quantile = float(statistics.t_quantile[d])
@@ -116,8 +123,10 @@ def _explain_status(
     status: EstimateStatus,
     lacks_stderr: bool,
     groups: tuple[IdentifiableCombination, ...],
+    *,
+    is_limited: bool,
 ) -> str:
-    """Explain why there is no standard error, or its limits."""
+    """Explain why there is no standard error, or its limits; or that the value is one."""
     if status == "group":
         expressions = [group.text for group in groups if name in group.members]
         more = ", …" if len(expressions) > _MAX_NAMED_GROUPS else ""
@@ -133,6 +142,7 @@ def _explain_status(
     return {
         "unidentifiable": "these data determine it poorly: its standard error is as large as "
         "its range",
+        "identified": AT_LIMIT if is_limited else "",
         "at bound": "it lies at its bound; the standard error is that of the linear model",
     }.get(status, "")
 

@@ -18,7 +18,9 @@ place of a jump follows the larger of two exponential variables then, not χ²: 
 -2 ln(1 - √0.95) = 7.35 (Hansen, Econometrica 68 (2000) 575).
 
 Where Q stays below the limit up to the bound, the end is *open*: the data say nothing there. It is
-open as well if another parameter meets its bound before: without that, the valley would go on.
+open as well if another parameter meets its bound before: without that, the valley would go on. A
+bound that is a physical limit closes it. No value lies beyond, and the set that the likelihood
+ratio does not rule out ends there (Self and Liang, J. Am. Stat. Assoc. 82 (1987) 605).
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -32,7 +34,7 @@ from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 from sysid.identifiability.exchange import find_ordered_partners
 from sysid.search.least_squares import ScoredSamples, fill_jacobian
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import from_unit, is_at_bounds, to_unit
+from sysid.simulation.scaling import find_physical_bounds, from_unit, is_at_bounds, to_unit
 from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.estimates import Estimate, IntervalEnd
 from sysid.uncertainty.intervals import ProfileEnds
@@ -110,13 +112,15 @@ class _StoppedError(Exception):
 class _End(NamedTuple):
     """An end of an interval in unit coordinates.
 
-    It is open if only a bound stops it. `limit` is the parameter with that bound. If the steps did
-    not suffice, it `is_rough`: a point inside.
+    It is open if only a bound of the search stops it. `limit` is the parameter with that bound. If
+    the steps did not suffice, it `is_rough`: a point inside. `meets_limit`: a parameter is at a
+    physical limit there.
     """
 
     position: float
     limit: str = ""
     is_rough: bool = False
+    meets_limit: bool = False
 
 
 class _Valley(NamedTuple):
@@ -156,6 +160,7 @@ class _EndSearch:
         model: LikelihoodModel,
         most: int,
     ) -> None:
+        self._groups = () if analysis.uncertainty is None else analysis.uncertainty.groups
         self._problem, self._exchanges, self._most = problem, analysis.exchanges, most
         self._likelihood, self._quantiles = Likelihood(problem, model), model.quantiles
         self.evaluations = 0
@@ -165,14 +170,19 @@ class _EndSearch:
         self._start = self._linearise(self._point)
         # The output does not change near a lag on a plateau, which stays where it is.
         self._moves: BoolArray = np.any(self._start.columns != 0.0, axis=0)
+        self._is_physical = find_physical_bounds(problem.free_parameters)
         self._local_ends, self._resolution = np.zeros((theta.size, 2)), np.zeros(theta.size)
 
     def select_doubtful(self, estimates: Sequence[Estimate], correlation: FloatArray) -> list[int]:
         """Select the parameters whose local interval may not hold."""
+        evaluator = self._problem.evaluator
+        widths = evaluator.upper - evaluator.lower
+        is_mirrored = self._find_mirrored(estimates)
         errors = np.array([one.stderr or 0.0 for one in estimates])
+        errors = np.where(is_mirrored, widths / self._quantiles, errors)
         at_bound = np.array([one.status == "at bound" for one in estimates])
         chosen = np.flatnonzero((errors > 0.0) & ~at_bound)
-        evaluator, reach = self._problem.evaluator, self._quantiles * errors
+        reach = self._quantiles * errors
         points, shares = [], []
         for d in chosen.tolist():
             valley = self._find_valley(self._start, self._point, d)
@@ -182,7 +192,8 @@ class _EndSearch:
             )
             shares.append(np.abs(ends[:, d] - self._theta[d]) / reach[d])
             self._local_ends[d] = to_unit(evaluator, ends)[:, d]
-            self._resolution[d] = _RESOLUTION * np.ptp(self._local_ends[d])
+            if not is_mirrored[d]:  # the range that its steps begin with resolves nothing
+                self._resolution[d] = _RESOLUTION * np.ptp(self._local_ends[d])
             steps = self._local_ends[d] - self._point[d]
             points.append(np.clip(self._point + steps[:, None] * valley.turning, 0.0, 1.0))
         ratios = self._compute_ratios(np.concatenate(points)).reshape(-1, 2)
@@ -191,8 +202,22 @@ class _EndSearch:
             is_curved = np.any(np.abs(roots / np.array(shares) - 1.0) > _NOTABLE_CURVATURE, axis=1)
         related = np.abs(correlation[np.ix_(chosen, chosen)]) - np.eye(chosen.size)
         is_related = np.any(related > _HIGH_CORRELATION, axis=1)
-        is_doubtful = is_curved | is_related | ~self._moves[chosen]
+        is_doubtful = is_curved | is_related | ~self._moves[chosen] | is_mirrored[chosen]
         return [int(d) for d in chosen[is_doubtful]]
+
+    def _find_mirrored(self, estimates: Sequence[Estimate]) -> BoolArray:
+        """Find parameters (D,) without an error, in a combination that has a physical limit."""
+        bounded = np.any(self._is_physical, axis=0)
+        limited = {one.name for one, has_limit in zip(estimates, bounded, strict=True) if has_limit}
+        members = {
+            name for group in self._groups if limited & set(group.members) for name in group.members
+        }
+        return np.array(
+            [
+                one.stderr is None and one.status == "group" and one.name in members
+                for one in estimates
+            ]
+        )
 
     def find_ends(self, d: int) -> ProfileEnds | None:
         """Find both ends of a parameter; None if the search stopped before."""
@@ -208,7 +233,9 @@ class _EndSearch:
             if end.limit:
                 limits[name] = end.limit
         is_closed = not (limits or any(end.is_rough for end in ends))
-        return ProfileEnds((lower, upper), limits, is_closed, is_set=not self._moves[d])
+        meets_limit = any(end.meets_limit for end in ends)
+        is_set = not self._moves[d]
+        return ProfileEnds((lower, upper), limits, is_closed, is_set, meets_limit)
 
     def _find_end(self, d: int, number: int) -> _End:
         """Find the lower end (0) or the upper one (1).
@@ -229,15 +256,18 @@ class _EndSearch:
             if valley.ratio < limit:
                 inside = float(point[d])
                 if inside == max(side, 0.0):
-                    return _End(inside, self._problem.free_names[d])
+                    is_closed = bool(self._is_physical[number, d])
+                    name = "" if is_closed else self._problem.free_names[d]
+                    return _End(inside, name, meets_limit=self._meets_limit(point))
             else:
                 outside = float(point[d])
             if abs(outside - inside) <= self._resolution[d]:
-                return _End(inside)
+                return _End(inside, meets_limit=self._meets_limit(point))
             step = valley.find_step(side, limit, self._find_longest_step(point, d))
             target = float(np.clip(point[d] + step, 0.0, 1.0))
             if abs(root - 1.0) <= _TOLERANCE:
-                return _End(target, self._name_limit(linear, point, d, limit))
+                name = self._name_limit(linear, point, d, limit)
+                return _End(target, name, meets_limit=self._meets_limit(point))
             if not side * inside < side * target < side * outside:
                 target = 0.5 * (inside + outside) if np.isfinite(outside) else target
             point = self._follow(point, valley, d, target - float(point[d]), limit)
@@ -248,12 +278,17 @@ class _EndSearch:
         """Compute the value of Q at an end."""
         return float(self._quantiles[d]) ** 2 * (1.0 if self._moves[d] else _JUMP_LIMIT)
 
+    def _meets_limit(self, point: FloatArray) -> bool:
+        """Whether a parameter is at a physical limit at a point."""
+        return bool(np.any(np.array(is_at_bounds(point)) & self._is_physical))
+
     def _name_limit(self, linear: LinearRatio, point: FloatArray, d: int, limit: float) -> str:
         """Name another parameter whose bound ends the valley at a point: without it Q is smaller.
 
-        It has met that bound on the way from the estimate. Empty: no bound matters.
+        It has met that bound on the way from the estimate. Empty: no bound of the search matters.
         """
-        is_held = np.logical_or(*is_at_bounds(point)) & ~np.logical_or(*is_at_bounds(self._point))
+        is_held = np.any(np.array(is_at_bounds(point)) & ~self._is_physical, axis=0)
+        is_held &= ~np.logical_or(*is_at_bounds(self._point))
         is_held &= self._moves & (np.arange(point.size) != d)
         if not is_held.any():
             return ""

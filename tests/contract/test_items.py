@@ -75,6 +75,8 @@ def end_job(
             if state is JobState.CANCELLED:
                 end = JobState.CANCELLED
                 continue
+            if state is JobState.FAILED and end is JobState.SUCCEEDED:
+                end = JobState.INCOMPLETE
             done = {"estimates": {}, "parameters": []} if state is JobState.SUCCEEDED else None
             RunWriter(session, claim.lease).record_outcomes(
                 [
@@ -326,6 +328,15 @@ def test_a_resumed_job_does_not_compute_a_deleted_run_again(database: Database) 
         )
         ended = LeaseQueue(session).finish_job(claim.lease, JobState.SUCCEEDED)
         assert (ended.n_runs, ended.n_done, ended.n_failed) == (5, 5, 0)
+
+
+def test_a_job_is_complete_once_its_last_failed_run_is_deleted(database: Database) -> None:
+    states = (JobState.SUCCEEDED, JobState.FAILED, JobState.FAILED)
+    job, runs = end_job(database, states)
+    for run, state in ((runs[1], JobState.INCOMPLETE), (runs[2], JobState.SUCCEEDED)):
+        delete(database, "run", run)
+        with database.read_session() as session:
+            assert JobRepository(session).get(job).state is state
 
 
 def test_dispatchers_share_a_resumed_job_without_its_deleted_runs(database: Database) -> None:

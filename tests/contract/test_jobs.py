@@ -291,6 +291,7 @@ def test_jobs_are_listed_and_counted_by_state(database):
             JobState.SUCCEEDED: 0,
             JobState.FAILED: 0,
             JobState.CANCELLED: 0,
+            JobState.INCOMPLETE: 0,
         }
 
 

@@ -377,7 +377,7 @@ def end_all(desk: Desk, n_failed: int) -> None:
     ("n_failed", "state", "error"),
     [
         (0, JobState.SUCCEEDED, None),
-        (1, JobState.SUCCEEDED, "1 of 4 runs failed: reason 0"),
+        (1, JobState.INCOMPLETE, "1 of 4 runs failed: reason 0"),
         (4, JobState.FAILED, "4 of 4 runs failed: reason 0; reason 1; reason 2"),
     ],
 )

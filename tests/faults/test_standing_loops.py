@@ -1,5 +1,6 @@
 """A process whose main loop or whose threads stand is ended, and says so."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -7,6 +8,7 @@ import time
 from pathlib import Path
 
 import httpx
+import psutil
 import pytest
 
 from service.client.embedded import find_free_port
@@ -68,10 +70,71 @@ def test_a_dispatcher_whose_main_loop_stands_ends_and_tells_where_it_stood() -> 
 
 
 def test_a_dispatcher_that_stands_in_native_code_ends_too() -> None:
-    code = NATIVE.replace("loop.turn()", "")  # no loop is watched: only the timer ends it
+    code = NATIVE.replace("loop.turn()", "")  # no loop is watched: only the outer watch ends it
     ended = run(code, "native")
-    assert ended.returncode == 1
-    assert "Timeout" in ended.stderr
+    assert ended.returncode == -signal.SIGABRT
+    assert "Aborted" in ended.stderr
+    assert "in <module>" in ended.stderr
+
+
+TURNING = """
+import sys, threading, time
+from sysid.core import awake_clock
+from service.core.process import loop_watch, outer_watch
+awake_clock.NAP_SECONDS = outer_watch.NAP_SECONDS = 0.1
+loop_watch.STANDS_SECONDS, loop_watch.LOOK_SECONDS = 1.0, 0.1
+loop, stopping = loop_watch.LoopWatch(), threading.Event()
+loop.turn()
+loop_watch.end_if_standing(loop, stopping, lambda: print("ended", flush=True))
+for _ in range(int(sys.argv[1])):
+    time.sleep(0.02)
+    loop.turn()
+    print(".", flush=True)
+stopping.set()
+time.sleep(0.3)
+"""
+
+
+@pytest.mark.parametrize("stops_all", [True, False], ids=["all", "alone"])
+def test_a_process_that_was_stopped_for_long_goes_on(stops_all: bool) -> None:
+    """SIGSTOP stops a process as a suspended machine does, while its clocks go on."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", TURNING, "60"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    stop = os.killpg if stops_all else os.kill  # with the child that watches it, or without
+    assert process.stdout is not None
+    try:
+        for _ in range(20):
+            assert process.stdout.readline() == ".\n"
+        stop(process.pid, signal.SIGSTOP)
+        time.sleep(4.0)
+        stop(process.pid, signal.SIGCONT)
+        said, log = process.communicate(timeout=LIMIT_SECONDS)
+    finally:
+        os.killpg(process.pid, signal.SIGKILL) if process.poll() is None else None
+    assert process.returncode == 0, log
+    assert said.count(".") == 40
+    assert "ended" not in said
+    assert log == ""
+
+
+def test_no_process_is_left_of_one_that_was_watched_and_killed() -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", TURNING, "10000"], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    limit = time.monotonic() + LIMIT_SECONDS
+    while not (children := psutil.Process(process.pid).children()):
+        assert process.stdout.readline() == ".\n"
+        assert time.monotonic() < limit
+    process.kill()
+    process.communicate()
+    _, alive = psutil.wait_procs(children, timeout=LIMIT_SECONDS)
+    assert alive == []
 
 
 def test_a_web_process_ends_after_a_signal_whatever_its_threads_wait_for() -> None:

@@ -4,11 +4,13 @@ import json
 import re
 from typing import Any
 
+import pytest
 import yaml
 from jsonschema import Draft202012Validator
 from prometheus_client.parser import text_string_to_metric_families
 
 from service.api.queue_metrics import write_metrics
+from service.core import settings
 from service.core.settings import Settings
 from service.storage.sessions import Database
 from tests.support.checkout import ROOT
@@ -301,13 +303,17 @@ def test_kubernetes_is_told_the_version_of_ray_that_is_locked() -> None:
     assert [one["spec"]["rayVersion"] for one in _kubernetes("RayCluster")] == locked
 
 
-def test_the_web_processes_of_two_versions_never_serve_at_once_and_their_memory_suffices() -> None:
+def test_the_web_processes_of_two_versions_never_serve_at_once_and_their_memory_suffices(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     (deployment,) = _kubernetes("Deployment")
     assert deployment["spec"]["strategy"] == {"type": "Recreate"}
     (web,) = deployment["spec"]["template"]["spec"]["containers"]
-    (n_uploads,) = [one["value"] for one in web["env"] if one["name"] == "LAGID_MAX_UPLOADS"]
-    limit = int(web["resources"]["limits"]["memory"].removesuffix("Gi"))
-    assert limit >= 4 * int(n_uploads) + 1
+    limit = int(web["resources"]["limits"]["memory"].removesuffix("Gi")) * 2**30
+    monkeypatch.setattr(settings, "read_memory_bytes", lambda: limit)
+    service = Settings()
+    assert service.reader_memory_bytes >= 900 * 2**20  # enough for a recording of some 100 MB
+    assert service.max_uploads * service.reader_memory_bytes <= limit - 2 * 2**30
 
 
 def test_our_containers_may_open_many_connections_and_are_started_again() -> None:

@@ -115,7 +115,7 @@ RULES: tuple[tuple[type[ServiceError], _Rule], ...] = (
     (errors.ForeignOrigin, _is_unsafe),
     (errors.OutOfScope, _needs_key),
     (errors.NotFound, _names_resource),
-    (errors.StalledRequest, _has_file),
+    (errors.StalledRequest, _has_body),
     (errors.Conflict, _names_resource),
     (errors.StaleVersion, _has_precondition),
     (errors.TooLarge, _has_body),

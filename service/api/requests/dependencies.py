@@ -1,8 +1,8 @@
 """Dependencies of routes: the parts of the service, sessions, and page cursors."""
 
-import asyncio
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from threading import Event
 from typing import Annotated
 
@@ -14,10 +14,14 @@ from service.api.event_feed import EventFeed
 from service.api.requests.failure_delay import FailureDelay
 from service.api.requests.request_log import get_request_id
 from service.api.store_probe import StoreProbe
+from service.core.process.concurrency import FairPlaces
 from service.core.settings import Settings
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database, SessionOwner
 from service.upkeep.scrubber import Scrubber
+
+MAX_WAITING_UPLOADS = 200
+"""Uploads of one project that wait for a place; they need neither thread nor disk."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +34,8 @@ class Parts:
         For a request, that of its caller: it shows the caller's project alone.
     stopping : Event
         Set as soon as the process is asked to end. Open event streams then close.
-    upload_places : Semaphore
-        Places of the uploads that are received and read at once.
+    upload_places, reader_places : FairPlaces
+        Places of the uploads that are received, and of those that are read.
     feed : EventFeed
         The events of all jobs that have a stream.
     probe : StoreProbe
@@ -46,7 +50,8 @@ class Parts:
     database: Database
     store: ObjectStore
     stopping: Event
-    upload_places: asyncio.Semaphore
+    upload_places: FairPlaces
+    reader_places: FairPlaces
     feed: EventFeed
     probe: StoreProbe
     scrubber: Scrubber
@@ -57,9 +62,20 @@ class Parts:
         """Build the parts of a process."""
         stopping = Event()
         feed = EventFeed(database, stopping, settings.poll_seconds, settings.max_streams)
-        places = asyncio.Semaphore(settings.max_uploads)
-        scrubber = Scrubber(store, settings.scrub_days)
-        return cls(settings, database, store, stopping, places, feed, StoreProbe(store), scrubber)
+        most = settings.max_uploads
+        build = partial(FairPlaces, waiting=MAX_WAITING_UPLOADS, what="uploads (LAGID_MAX_UPLOADS)")
+        return cls(
+            settings,
+            database,
+            store,
+            stopping,
+            # A body that arrives slowly takes a place of its own project alone.
+            upload_places=build(settings.max_connections, most),
+            reader_places=build(most, max(1, most - 1)),
+            feed=feed,
+            probe=StoreProbe(store),
+            scrubber=Scrubber(store, settings.scrub_days),
+        )
 
     def open_for(self, owner: SessionOwner) -> "Parts":
         """Return the same parts for requests of an owner."""

@@ -1,10 +1,12 @@
-"""What holds for every request and answer: who may ask, the size of a body, and headers.
+"""What holds for every request and answer: who may ask, the size and pace of a body, and headers.
 
-FastAPI reads a whole body before it parses it, so the limit must apply while it is received.
-Uploads have a separate limit.
+FastAPI reads a whole body before it parses it, so the limits must apply while it is received.
+Uploads have a separate limit of their size.
 """
 
+import asyncio
 import re
+import time
 from collections.abc import Mapping
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -14,11 +16,59 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.api.requests.problems import error_response
 from service.api.requests.request_root_path import get_service_path
 from service.core.bodies.text_checks import parse_digits
-from service.core.errors import ForeignOrigin, MisdirectedRequest, TooLarge
+from service.core.errors import ForeignOrigin, MisdirectedRequest, StalledRequest, TooLarge
 from service.core.settings import Settings
 
 UPLOAD_ROUTE = ("POST", "/v1/datasets")
 """The upload goes to a file while it arrives (`service.api.content`)."""
+
+
+MAX_PAUSE_SECONDS = 60.0
+"""Longest pause between two pieces of a body."""
+BODY_SECONDS = 20.0
+BODY_RATE = 500.0
+"""Time for a body, and the bytes that give it a further second: those of Apache's
+`mod_reqtimeout`."""
+
+
+class BodyPace:
+    """Middleware that refuses a body whose sender stops, or sends a byte now and then.
+
+    Only the time in which the service waits for the sender counts.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on and watch how its body arrives."""
+        is_http = scope["type"] == "http"
+        await self._app(scope, self._limit_receive(receive) if is_http else receive, send)
+
+    def _limit_receive(self, receive: Receive) -> Receive:
+        size, waited, is_complete = 0, 0.0, False
+
+        async def receive_in_time() -> Message:
+            nonlocal size, waited, is_complete
+            if is_complete:
+                return await receive()  # which waits for the end of the connection
+            begun = time.monotonic()
+            left = max(0.0, BODY_SECONDS + size / BODY_RATE - waited)
+            try:
+                async with asyncio.timeout(min(left, MAX_PAUSE_SECONDS)):
+                    message = await receive()
+            except TimeoutError:
+                raise StalledRequest(
+                    f"{size} bytes of the body came within {waited + left:.0f} s, or nothing for "
+                    f"{MAX_PAUSE_SECONDS:g} s. Need {BODY_RATE:g} bytes a second after the first "
+                    f"{BODY_SECONDS:g} s"
+                ) from None
+            waited += time.monotonic() - begun
+            size += len(message.get("body", b""))
+            is_complete = not message.get("more_body", False)
+            return message
+
+        return receive_in_time
 
 
 class BodyLimit:

@@ -10,6 +10,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from sqlalchemy.exc import TimeoutError as SqlTimeout
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse, Response
 
 from service.api.requests.html_answers import PROTECTIVE_HEADERS, error_page, wants_html
@@ -42,6 +43,7 @@ MAX_FAULTS = 1000
 """Limit on reported fields, since each one is compared with the valid names."""
 MAX_DETAIL_CHARACTERS, MAX_TOTAL_CHARACTERS = 1000, 20_000
 """Limits for one message and for all: a quoted value may be as long as the body."""
+CLIENT_GONE = 499
 PROBLEM_TYPE = "application/problem+json"
 STATUS_KINDS = {
     404: "not-found",
@@ -116,6 +118,7 @@ def install_handlers(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, _handle_http_error)
     for passing in (*TRANSIENT_ERRORS, SqlTimeout):
         app.add_exception_handler(passing, _handle_database_outage)
+    app.add_exception_handler(ClientDisconnect, _handle_disconnect)
     app.add_exception_handler(RecursionError, _handle_recursion_error)
     app.add_exception_handler(UnicodeEncodeError, _handle_unicode_error)
     app.add_exception_handler(OSError, _handle_os_error)
@@ -177,6 +180,12 @@ def _handle_database_outage(request: Request, error: Exception) -> Response:
         service_metrics.store_errors.labels("database").inc()
         detail = "all connections to the database are in use. Nothing was changed. Try again."
     return error_response(request, Unavailable(detail))
+
+
+def _handle_disconnect(request: Request, _error: Exception) -> Response:
+    """Answer nobody: the sender of a body has gone. Log and metrics have nginx's status of that."""
+    log.info("%s %s: the sender broke off", request.method, request.url.path)
+    return Response(status_code=CLIENT_GONE)
 
 
 def _handle_os_error(request: Request, error: Exception) -> Response:

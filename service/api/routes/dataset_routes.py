@@ -44,6 +44,7 @@ from service.datasets.dataset_schemas import (
     SimulateIn,
 )
 from service.datasets.stored_recordings import load_recording
+from service.formats.limits import UploadLimits
 from service.formats.tabular.csv_recordings import generate_csv
 from service.items.item_schemas import DeletedOut, EditIn
 from service.repositories.dataset_rows import DatasetRepository, StoredDataset
@@ -94,7 +95,11 @@ async def add_dataset(
 
     The kind is recognised by the bytes. The same bytes again return the same dataset (200).
     """
-    async with receive_upload(request, parts.settings, parts.upload_places) as upload:
+    project, settings = parts.database.owner.project_id, parts.settings
+    async with (
+        receive_upload(request, settings, parts.upload_places, project) as upload,
+        parts.reader_places.hold_awaiting(project),
+    ):
         stored = await run_in_threadpool(
             datasets.add_upload,
             parts.database,
@@ -105,6 +110,9 @@ async def add_dataset(
             name=name or upload.name,
             segments=[column.strip() for column in (segments or "").split(",") if column.strip()],
             sample_time=sample_time,
+            limits=UploadLimits(
+                file_bytes=settings.max_upload_bytes, memory_bytes=settings.reader_memory_bytes
+            ),
         )
     return _dataset_response(stored, response, name)
 

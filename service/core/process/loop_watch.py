@@ -1,15 +1,18 @@
 """Whether a main loop turns, or stands in a call that does not return.
 
 A process that lives is not one that works. So whoever speaks for a loop, such as a thread that
-sends heartbeats, asks here first.
+sends heartbeats, asks here first. Time counts only while the process could run: a suspended machine
+ends nobody (`sysid.core.awake_clock`).
 """
 
 import faulthandler
 import logging
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+from service.core.process.outer_watch import OuterWatch
+from sysid.core.awake_clock import read_awake_seconds
 
 _log = logging.getLogger(__name__)
 
@@ -26,10 +29,10 @@ class LoopWatch:
     Parameters
     ----------
     stopwatch : callable
-        Elapsed seconds.
+        Elapsed seconds of this process.
     """
 
-    def __init__(self, stopwatch: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, stopwatch: Callable[[], float] = read_awake_seconds) -> None:
         self._stopwatch = stopwatch
         self._late_at: float | None = None  # from then on it stands
 
@@ -79,22 +82,24 @@ def end_if_standing(
     """Watch a loop in a thread until `stopping`, and call `end` if it stands.
 
     Whoever started the process starts it anew. The log gets the stack of each thread. Native code
-    may keep even the watching thread from running. Then a timer of the C library ends the process.
+    may keep even the watching thread from running. Then a child of the process ends it.
 
     Parameters
     ----------
     look : callable
         Is called every second.
     """
+    faulthandler.enable()  # the stacks of a process that the outer watch ends
+    outer = OuterWatch(2 * STANDS_SECONDS)
 
     def watch() -> None:
         while not stopping.wait(LOOK_SECONDS):
-            faulthandler.dump_traceback_later(2 * STANDS_SECONDS, exit=True)
+            outer.speak()
             look()
             if loop.standing_seconds > STANDS_SECONDS:
                 _log.error("the main loop stands for %g s. What it does follows", STANDS_SECONDS)
                 faulthandler.dump_traceback()
                 end()
-        faulthandler.cancel_dump_traceback_later()
+        outer.close()
 
     threading.Thread(target=watch, name="watch", daemon=True).start()

@@ -15,6 +15,8 @@ from sysid.core.errors import UnreadableFile
 
 MAX_LINE_CHARACTERS = 1_000_000
 _BLOCK_BYTES = 1 << 20
+_NO_MEMORY = "Error -4 "
+"""How `zlib.error` begins if zlib gets no memory (Z_MEM_ERROR of its manual)."""
 _MARKS = (
     (codecs.BOM_UTF32_LE, "utf-32"),
     (codecs.BOM_UTF32_BE, "utf-32"),
@@ -68,7 +70,9 @@ def open_text(
             binary.seek(0)
             with TextIOWrapper(binary, encoding=encoding, newline="") as stream:
                 yield _iterate_lines(stream)
-        except (EOFError, gzip.BadGzipFile, zlib.error):
+        except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+            if str(error).startswith(_NO_MEMORY):
+                raise MemoryError from None
             raise UnreadableFile("the gzip data are damaged or cut off") from None
 
 

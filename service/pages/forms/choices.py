@@ -67,16 +67,22 @@ def list_choices() -> dict[str, list[tuple[str, str]]]:
     }
 
 
-def write_choice(field: str, entries: Mapping[str, str]) -> str:
+def write_choice(place: Sequence[str], entries: Mapping[str, str]) -> str:
     """Write a setting of a note as the form has it: the field's label and the chosen text.
 
-    >>> write_choice("hold", {"u": "zero"})
+    That of a parameter is one of the model as text.
+
+    >>> write_choice(["hold"], {"u": "zero"})
     '“u between samples: held (zero)”'
+    >>> write_choice(["parameters", "r"], {"physical": "upper"})
+    '“physical: upper” of r in the model as text'
     """
+    field, *parts = place or [""]
     labels = {
         name: f"{name} between samples" if field == "hold" else _LABELS.get(name, name)
         for name in entries
     }
-    return " and ".join(
+    chosen = " and ".join(
         f"“{labels[name]}: {TEXTS.get(value, value)}”" for name, value in entries.items()
     )
+    return f"{chosen} of {parts[0]} in the model as text" if parts else chosen

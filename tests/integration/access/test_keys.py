@@ -442,6 +442,27 @@ def test_nothing_is_recorded_of_what_was_refused(keyed_service: Guarded) -> None
     assert keyed_service.ask("GET", "/v1/datasets", token).json()["items"] == []
 
 
+def test_what_is_simulated_on_request_counts_for_the_day(keyed_service: Guarded) -> None:
+    project = keyed_service.add_project("busy", max_daily_evaluations=2)
+    token = keyed_service.add_key(project)
+    body = {
+        "model": "fopdt",
+        "parameters": {"K": 2.0, "T": 1.5, "L": 0.7, "y0": 0.0},
+        "samples": 50,
+        "sample_time": 0.1,
+        "inputs": {"u": {"kind": "step"}},
+    }
+
+    def simulate(gain: float) -> Any:
+        changed = {**body, "parameters": {**body["parameters"], "K": gain}}  # type: ignore[dict-item]
+        return keyed_service.ask("POST", "/v1/datasets:simulate", token, json=changed)
+
+    assert [simulate(gain).status_code for gain in (1.0, 1.0, 2.0)] == [201, 200, 201]
+    read_faults(simulate(3.0), 429, "quota")
+    used = keyed_service.ask("GET", "/v1/access", token).json()["used"]
+    assert used["daily_evaluations"] == 2
+
+
 def test_failing_keys_wait_and_too_many_of_them_are_sent_away(tmp_path: Path) -> None:
     with guard("sqlite", tmp_path) as guarded:
         token, failures = guarded.add_key(), guarded.parts.failures

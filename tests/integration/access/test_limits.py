@@ -2,25 +2,38 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
+from pathlib import Path
 from threading import Barrier
 
+import numpy as np
 import pytest
+from sqlalchemy import func, select, update
 
 from service.core.errors import BudgetExceeded, QuotaExceeded
 from service.core.settings import Settings
 from service.core.states import JobState
+from service.datasets.datasets import add_recording
 from service.dispatch.held_leases import HeldLeases
 from service.jobs.submit import check_limits, resume_job
-from service.queue.daily_limit import stop_overruns
+from service.queue.daily_limit import check_budget, count_evaluations, stop_overruns
 from service.queue.leases import JobProgress, Lease, LeaseQueue
+from service.repositories import project_rows
 from service.repositories.audit_rows import list_actions
 from service.repositories.dataset_rows import DatasetRepository
 from service.repositories.job_rows import JobRepository
-from service.repositories.project_rows import ProjectRepository
+from service.repositories.project_rows import (
+    DAY,
+    REMOVAL_TIME,
+    RESULT_BYTES,
+    ProjectRepository,
+    count_stored_bytes,
+)
 from service.storage.columns import utc_now
+from service.storage.objects import open_store
 from service.storage.sessions import Database, SessionOwner, find_project
 from service.storage.storage_errors import RowConflict, RowNotFound
-from service.storage.tables import Job
+from service.storage.tables import Dataset, Job, RequestedWork
+from sysid.data.records import Channel, Recording
 from tests.support.storage.databases import record_statements
 from tests.support.storage.job_rows import claim, job_of, new_dataset, new_job, state_of, submit
 
@@ -29,8 +42,8 @@ SETTINGS = Settings()
 
 @pytest.fixture
 def limited_database(database: Database) -> Database:
-    """The database for a project that may store 25 bytes and make 100 evaluations a day."""
-    limits = {"max_stored_bytes": 25, "max_daily_evaluations": 100, "max_open_jobs": 3}
+    """The database for a project that may store 250 kB and make 100 evaluations a day."""
+    limits = {"max_stored_bytes": 250_000, "max_daily_evaluations": 100, "max_open_jobs": 3}
     with database.write_session() as session:
         project = ProjectRepository(session).add("limited")
         ProjectRepository(session).change_limits("limited", limits)
@@ -39,7 +52,7 @@ def limited_database(database: Database) -> Database:
 
 def add_dataset(database: Database, source: str) -> str:
     with database.write_session() as session:
-        new = new_dataset(source_key=source, size_bytes=10)
+        new = new_dataset(source_key=source, size_bytes=100_000, sha256=source)
         return str(DatasetRepository(session).add(new).dataset.id)
 
 
@@ -63,13 +76,72 @@ def end_job(database: Database, evaluations: int, hours_ago: float, **values: ob
 def test_stored_bytes_are_limited_and_a_deletion_makes_room(limited_database: Database) -> None:
     first = add_dataset(limited_database, "a")
     add_dataset(limited_database, "b")
-    with pytest.raises(BudgetExceeded, match="would store 30 bytes; at most 25") as error:
+    with pytest.raises(BudgetExceeded, match="would store 300000 bytes; at most 250000") as error:
         add_dataset(limited_database, "c")
     assert error.value.headers == {"Retry-After": "3600"}
     assert add_dataset(limited_database, "a") == first  # what is there already needs no room
     with limited_database.write_session() as session:
         DatasetRepository(session).delete(first)
     add_dataset(limited_database, "c")
+
+
+def test_deleted_bytes_count_until_they_are_removed(limited_database: Database) -> None:
+    for number in range(5):
+        added = add_dataset(limited_database, f"s{number}")
+        with limited_database.write_session() as session:
+            DatasetRepository(session).delete(added)
+    add_dataset(limited_database, "s0")  # the bytes of the first one, which are there
+    with pytest.raises(BudgetExceeded, match="would fill 600000 bytes; at most 500000"):
+        add_dataset(limited_database, "s5")
+    with limited_database.write_session() as session:
+        earlier = utc_now() - REMOVAL_TIME - timedelta(seconds=1)
+        was_deleted = Dataset.deleted_at.is_not(None)
+        session.execute(update(Dataset).where(was_deleted).values(deleted_at=earlier))
+    add_dataset(limited_database, "s5")
+
+
+def test_results_count_as_soon_as_a_job_is_queued_and_until_its_rows_are_removed(
+    limited_database: Database,
+) -> None:
+    def count() -> tuple[int, int]:
+        with limited_database.read_session() as session:
+            shown = count_stored_bytes(session, find_project(session))
+            there = count_stored_bytes(session, find_project(session), with_deleted=True)
+        return shown // RESULT_BYTES, there // RESULT_BYTES
+
+    end_job(limited_database, 0, hours_ago=1, n_runs=20, n_done=12)
+    assert count() == (12, 12)
+    add_job(limited_database, n_runs=10, n_done=4)
+    assert count() == (22, 22)
+    with limited_database.write_session() as session:
+        session.execute(update(Job).values(deleted_at=utc_now()).where(Job.n_runs == 20))
+    assert count() == (10, 22)
+    add_job(limited_database, n_runs=30)
+    with pytest.raises(BudgetExceeded, match="at most 250000"):
+        add_job(limited_database)
+    with limited_database.write_session() as session:
+        session.execute(update(Job).values(purged_at=utc_now()).where(Job.n_runs == 20))
+    assert count() == (40, 40)
+
+
+def test_what_a_project_has_no_room_for_is_not_written(
+    limited_database: Database, tmp_path: Path
+) -> None:
+    with limited_database.write_session() as session:
+        ProjectRepository(session).change_limits("limited", {"max_stored_bytes": 100})
+    store = open_store(tmp_path.as_uri())
+    recording = Recording((Channel("u", np.arange(9.0), np.zeros(9)),))
+    with pytest.raises(BudgetExceeded):
+        add_recording(
+            limited_database,
+            store,
+            recording,
+            name="x",
+            kind="upload",
+            key="k",
+            details={"warnings": []},
+        )
+    assert list(store.list_objects()) == []
 
 
 def test_bytes_that_are_stored_at_once_do_not_pass_the_limit_together(
@@ -185,8 +257,33 @@ def test_what_a_project_uses_is_measured(limited_database: Database) -> None:
         repository = ProjectRepository(session)
         used = repository.measure_use(repository.get("limited").id)
         others = repository.measure_use("proj_default")
-    assert (used.stored_bytes, used.daily_evaluations) == (10, 80)
+    assert (used.stored_bytes, used.daily_evaluations) == (100_000 + RESULT_BYTES, 80)
     assert (others.stored_bytes, others.daily_evaluations) == (0, 0)
+
+
+def test_what_a_web_process_computes_counts_for_a_day(
+    limited_database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def use() -> int:
+        with limited_database.read_session() as session:
+            return ProjectRepository(session).measure_use(find_project(session)).daily_evaluations
+
+    for evaluations in (1, 60, 39):
+        check_budget(limited_database)
+        count_evaluations(limited_database, evaluations)
+    assert use() == 100
+    with pytest.raises(BudgetExceeded, match="made 100 evaluations; 100 are allowed") as error:
+        check_budget(limited_database)
+    assert DAY.total_seconds() - 3600 <= int(error.value.headers["Retry-After"]) <= 86400
+    with pytest.raises(BudgetExceeded):
+        add_job(limited_database)
+    later = utc_now() + DAY
+    monkeypatch.setattr(project_rows, "utc_now", lambda: later)
+    assert use() == 0
+    count_evaluations(limited_database, 5)
+    with limited_database.read_session() as session:
+        assert session.scalar(select(func.count()).select_from(RequestedWork)) == 1
+    assert use() == 5
 
 
 def test_without_a_limit_nothing_is_counted(database: Database) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import socket
 import sqlite3
@@ -19,8 +20,10 @@ from fastapi import FastAPI
 from fastapi.responses import PlainTextResponse
 
 from service.api.app import create_app
+from service.cli import drill
 from service.cli.identify_command import FIELD_ORIGINS
 from service.client.embedded import find_free_port
+from service.core.errors import ServiceDidNotStart
 from service.storage.migrate import find_head_revision
 from sysid.core.errors import InvalidSettings
 from sysid.identification import identify
@@ -566,6 +569,46 @@ def test_the_doctor_finds_a_sound_installation(tmp_path: Path) -> None:
     done = run_lagid_process("doctor", "--data-dir", tmp_path, LAGID_PORT=str(find_free_port()))
     assert done.code == 0, done.stderr
     assert "compiled" in done.stdout
+
+
+@pytest.mark.slow
+def test_the_doctor_kills_a_worker_and_restores_a_backup_beside_the_users_data(
+    tmp_path: Path,
+) -> None:
+    own = {"LAGID_DATABASE_URL": "postgresql://nobody@127.0.0.1:1/none", "LAGID_AUTH": "keys"}
+    told = run_lagid_process(
+        "doctor",
+        "--deep",
+        "--json",
+        "--data-dir",
+        tmp_path / "data",
+        LAGID_PORT=str(find_free_port()),
+        LAGID_CPUS="1",
+        **own,
+    )
+    assert told.code == 0, told.stdout + told.stderr
+    found = {one["check"]: one["detail"] for one in json.loads(told.stdout)}
+    assert re.search(r"process \d+ was killed.* bit for bit equal", found["drill: a worker dies"])
+    assert "objects" in found["drill: backup"]
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_drill_whose_service_does_not_start_says_so_in_each_step(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def fail(*_arguments: object, **_options: object) -> None:
+        raise ServiceDidNotStart("it ended with exit code 1")
+
+    monkeypatch.setattr(drill, "run_embedded_service", fail)
+    monkeypatch.setenv("LAGID_PORT", str(find_free_port()))
+    told = run_lagid("doctor", "--deep", "--json", "--data-dir", tmp_path)
+    assert told.code == 1
+    failed = {one["check"]: one["detail"] for one in json.loads(told.stdout) if not one["ok"]}
+    assert failed == {
+        "drill: start": "the service did not start: it ended with exit code 1",
+        "drill: a worker dies": "not tried: the service did not start",
+        "drill: backup": "not tried: the service did not start",
+    }
 
 
 def test_a_number_that_is_none_is_one_line_and_never_sent(tmp_path: Path) -> None:

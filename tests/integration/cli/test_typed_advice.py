@@ -47,6 +47,8 @@ OPEN = "…"
 VALUES: dict[tuple[str, str], list[tuple[str, ...]]] = {
     ("hold", OPEN): [("u", hold) for hold in HOLDS],
     ("loss", "scale"): [("scale", "0.3")],
+    ("parameters", OPEN): [("upper", "0.5")],
+    ("parameters", "physical"): [("physical", "lower")],
 }
 """Field and name of a setting → names and values for what is open in it."""
 NAMES = {"skip": ("8",), "initial": ("rest", "free")}
@@ -90,7 +92,8 @@ def fill(match: re.Match[str]) -> Iterator[str]:
         VALUES.get((match["field"], name), [(name, value)]) for name, value in entries
     ]
     for filled in product(*choices):
-        yield f"{match['field']}: {{{', '.join(map(': '.join, filled))}}}"
+        setting = f"{{{', '.join(map(': '.join, filled))}}}"
+        yield f"{match['field']}: {f'{{L: {setting}}}' if match['part'] else setting}"
 
 
 def list_settings() -> list[str]:
@@ -136,6 +139,7 @@ def test_settings_are_found_where_they_are_written() -> None:
         "prediction: one-step",
     }
     some |= {"skip: 8", "initial: free", "initial: rest"}
+    some |= {"parameters: {L: {physical: lower}}"}
     assert some <= {*list_settings()}
     assert {"validation.fraction=0.3", "parameters.L.upper=0.5"} <= {*list_changes()}
 

@@ -30,9 +30,9 @@ def test_a_job_with_failed_runs_says_how_many_and_resumes_these(tmp_path: Path) 
             *(RunOutcome(run_id=run, state=JobState.FAILED, error="it diverged") for run in others),
         )
         with database.write_session() as session:
-            LeaseQueue(session).finish_job(got.lease, JobState.SUCCEEDED, "2 of 3 runs failed")
+            LeaseQueue(session).finish_job(got.lease, JobState.INCOMPLETE, "2 of 3 runs failed")
         job = client.get(f"/v1/jobs/{got.job.id}").json()
-        assert (job["state"], job["progress"]["failed"]) == ("succeeded", 2)
+        assert (job["state"], job["progress"]["failed"]) == ("incomplete", 2)
         assert _describe_state(job) == "2 of 3 failed"
         told = {**job, "outcome": {"verdict": "trustworthy"}}
         assert _describe_outcome(told) == "2 of 3 failed; best run: trustworthy"

@@ -15,10 +15,14 @@ from fastapi.testclient import TestClient
 
 from service.api.app import create_app
 from service.control.loop_answer import suggest_controller
-from service.core.process.concurrency import MAX_RUNNING, MAX_WAITING, simulation_limit
+from service.core.process.concurrency import (
+    MAX_OF_PROJECT,
+    MAX_WAITING,
+    simulation_places,
+)
 from service.jobs.stored_run import StoredRun
 from service.pages.simulation_page import _default_values, _FormContext
-from service.storage.tables import Dataset, Job, Run
+from service.storage.tables import DEFAULT_PROJECT, Dataset, Job, Run
 from sysid.models.catalogue.load import load_model
 from sysid.search import refine
 from sysid.search.refine import refine_candidates
@@ -425,11 +429,11 @@ def test_while_too_many_simulate_the_others_are_asked_to_come_again_and_nothing_
     query = {"kind": "loop", "gain": "1", "duration": "5", "sample_time": "0.1"}
     made = {**NOISELESS, "parameters": TRUE}
     with ExitStack() as others:
-        for _ in range(MAX_RUNNING):
-            others.enter_context(simulation_limit.acquire())
+        for _ in range(MAX_OF_PROJECT):
+            others.enter_context(simulation_places.hold(DEFAULT_PROJECT))
         for _ in range(MAX_WAITING):
-            assert simulation_limit._admitted.acquire(blocking=False)  # none is free
-            others.callback(simulation_limit._admitted.release)
+            waits = simulation_places._ask(DEFAULT_PROJECT)  # no more may wait
+            others.callback(simulation_places._give_back, DEFAULT_PROJECT, waits)
         for answer in (
             site.client.post(f"/v1/runs/{site.run}:simulate", json=step),
             site.client.post("/v1/datasets:simulate", json=made),

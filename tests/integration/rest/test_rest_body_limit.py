@@ -11,10 +11,11 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
-from service.api.requests import bodies
-from service.api.requests.middleware import BodyLimit
-from service.core.errors import InvalidRequest, TooLarge
+from service.api.requests import bodies, middleware
+from service.api.requests.middleware import BodyLimit, BodyPace
+from service.core.errors import InvalidRequest, StalledRequest, TooLarge
 from service.core.settings import Settings
+from tests.support.limits import LIMIT_SECONDS
 from tests.support.service.web_app import CSV, await_in_thread, read_faults, recording, settings_of
 
 LIMIT = 20_000
@@ -86,6 +87,57 @@ def test_nothing_of_a_long_body_is_read_and_of_one_of_unknown_length_no_more_tha
 ):
     assert read([(b"content-length", b"1000")], 100) == 0
     assert read([], 100) == 4
+
+
+class Sender:
+    """Sends pieces of a body with pauses, and then nothing."""
+
+    def __init__(self, pieces: list[tuple[float, bytes]]) -> None:
+        self.pieces = list(pieces)
+
+    async def __call__(self) -> dict[str, Any]:
+        if not self.pieces:
+            await asyncio.sleep(LIMIT_SECONDS)
+        pause, piece = self.pieces.pop(0)
+        await asyncio.sleep(pause)
+        return {"type": "http.request", "body": piece, "more_body": piece != b"end"}
+
+
+def receive_all(sender: Sender, thinking: float = 0.0) -> int:
+    """The bytes that an application gets, which may take its time between two pieces."""
+    sizes = []
+
+    async def application(scope: Any, receive: Any, send: Any) -> None:
+        is_complete = False
+        while not is_complete:
+            message = await receive()
+            sizes.append(len(message["body"]))
+            is_complete = not message["more_body"]
+            await asyncio.sleep(thinking)
+
+    async def play() -> None:
+        await BodyPace(application)({"type": "http", "method": "POST"}, sender, sender)
+
+    await_in_thread(play)
+    return sum(sizes)
+
+
+def test_a_body_that_stops_or_trickles_is_refused_and_one_that_waits_for_us_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(middleware, "BODY_SECONDS", 0.5)
+    monkeypatch.setattr(middleware, "BODY_RATE", 100.0)
+    end = (0.0, b"end")
+    trickle = [(0.2, b"x")] * 10
+    for pieces in ([(0.0, b"x")], trickle, [*trickle, end]):
+        with pytest.raises(StalledRequest, match=r"100 bytes a second after the first 0\.5 s"):
+            receive_all(Sender(pieces))
+    steady = [(0.1, b"x" * 20)] * 10  # 200 bytes a second
+    assert receive_all(Sender([*steady, end])) == 203
+    assert receive_all(Sender([(0.0, b"x")] * 8 + [end]), thinking=0.1) == 11
+    monkeypatch.setattr(middleware, "MAX_PAUSE_SECONDS", 0.2)
+    with pytest.raises(StalledRequest, match=r"nothing for 0\.2 s"):
+        receive_all(Sender([(0.0, b"x" * 10_000), (0.6, b"x")]))
 
 
 def test_a_sweep_over_forty_thousand_labelled_values_is_within_the_limit(

@@ -125,27 +125,25 @@ def test_uploads_at_once_are_bounded_and_each_gives_its_place_back(
 
     app = create_app(settings_of(tmp_path, max_uploads=1))
     with TestClient(app, raise_server_exceptions=False) as client:
-        places = parts_of(client).upload_places
+        places = parts_of(client).reader_places
         assert post(recording()).status_code == 201
         read_faults(post(b"no recording"), 422, "invalid-upload")
-        monkeypatch.setattr(content, "MAX_WAIT_SECONDS", 0.1)
-        assert client.portal is not None
-        client.portal.call(places.acquire)  # as an upload that is on its way
-        answer = post(recording(period=0.2))
+        monkeypatch.setattr(places, "_seconds", 0.1)
+        with places.hold("another"):  # as an upload that is read
+            answer = post(recording(period=0.2))
         read_faults(answer, 503, "unavailable")
         assert "LAGID_MAX_UPLOADS" in answer.json()["detail"]
         assert int(answer.headers["retry-after"]) > 0
-        client.portal.call(places.release)
         held = []
         add_upload = datasets.add_upload
 
         def add(*args: Any, **options: Any) -> Any:
-            held.append(places.locked())
+            held.append(places._free)
             return add_upload(*args, **options)
 
         monkeypatch.setattr(datasets, "add_upload", add)
         assert post(recording(period=0.2)).status_code == 201
-        assert held == [True]
+        assert held == [0]
 
 
 def test_another_fault_of_a_disk_is_not_told_as_a_full_one_and_its_words_stay_inside(

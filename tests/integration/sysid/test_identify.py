@@ -133,7 +133,10 @@ def test_a_bound_that_is_to_be_widened_is_told_once() -> None:
     assert found["c"].status == "at bound"
     [note] = [w for w in found.warnings if w.startswith(("c is at its", "c lies at its"))]
     assert note.startswith("c is at its lower bound 5 N·s/m and L lies at its lower bound 0 s. ")
-    assert note.endswith("To widen: lower the bound of c, unless it is a physical limit.")
+    assert note.endswith(
+        "To widen: lower the bound of c. Or set parameters={'c': {'physical': 'lower'}} if it is a "
+        "physical limit."
+    )
 
 
 def test_progress_is_told_and_ends_at_the_result() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from sysid.core.awake_clock import read_awake_seconds
 from tests.support.cluster.inline_executor import InlineExecutor
 from tests.support.cluster.small_runs import ListedRuns, Notebook, bits, carry_out, spec
 from tests.support.limits import LIMIT_SECONDS
@@ -101,7 +102,7 @@ def test_a_ray_that_does_not_answer_a_probe_is_lost(
     never = ray_executor._noop.options(resources={"of no machine": 1.0})
     monkeypatch.setattr(ray_executor, "_noop", never)
     monkeypatch.setattr(ray_executor, "_probe", None)
-    monkeypatch.setattr(ray_executor, "_last_answer", time.monotonic())
+    monkeypatch.setattr(ray_executor, "_last_answer", read_awake_seconds())
     try:
         with pytest.raises(ClusterLost, match="has not answered"):
             check_until_lost(ray_executor)

@@ -1,6 +1,8 @@
 """The web application on a port of loopback, in a thread of the tests' process."""
 
+import faulthandler
 import socket
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -9,6 +11,8 @@ from contextlib import contextmanager
 import uvicorn
 from fastapi import FastAPI
 
+from service.api.connections import limit_connections
+from sysid.core.awake_clock import read_awake_seconds
 from tests.support.limits import LIMIT_SECONDS
 
 REQUESTS_LIMIT_SECONDS = 10
@@ -16,7 +20,9 @@ REQUESTS_LIMIT_SECONDS = 10
 
 
 @contextmanager
-def serve_in_thread(app: FastAPI, bound: socket.socket | None = None) -> Iterator[str]:
+def serve_in_thread(
+    app: FastAPI, bound: socket.socket | None = None, *, most_connections: int = 1000
+) -> Iterator[str]:
     """Serve the application for the length of the block, at the address that is given.
 
     With a bound socket at its port; the server closes that socket. The server has ended when
@@ -30,6 +36,7 @@ def serve_in_thread(app: FastAPI, bound: socket.socket | None = None) -> Iterato
         ws="none",
         timeout_graceful_shutdown=REQUESTS_LIMIT_SECONDS,
     )
+    limit_connections(config, most_connections)
     server = uvicorn.Server(config)
     sockets = None if bound is None else [bound]
     thread = threading.Thread(target=server.run, args=(sockets,), name="server")
@@ -44,5 +51,16 @@ def serve_in_thread(app: FastAPI, bound: socket.socket | None = None) -> Iterato
         if hasattr(app.state, "parts"):
             app.state.parts.stopping.set()
         server.should_exit = True
-        thread.join(timeout=LIMIT_SECONDS)
-        assert not thread.is_alive(), "the server did not stop"
+        limit = read_awake_seconds() + LIMIT_SECONDS  # a suspended machine stops nothing
+        while thread.is_alive() and read_awake_seconds() < limit:
+            thread.join(timeout=1.0)
+        assert not thread.is_alive(), f"the server did not stop\n{_describe_standing(server)}"
+
+
+def _describe_standing(server: uvicorn.Server) -> str:
+    """Describe what a server waits for: its connections and requests, and all threads."""
+    state = server.server_state
+    with tempfile.TemporaryFile("w+") as file:
+        faulthandler.dump_traceback(file)
+        file.seek(0)
+        return f"{state.connections}\n{state.tasks}\n{file.read()}"

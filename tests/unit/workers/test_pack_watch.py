@@ -68,6 +68,7 @@ class HangingExecutor(ScriptedExecutor):
 def clock(monkeypatch: pytest.MonkeyPatch) -> Time:
     made = Time()
     monkeypatch.setattr(time, "monotonic", made)
+    monkeypatch.setattr(scheduler, "read_awake_seconds", made)
     return made
 
 

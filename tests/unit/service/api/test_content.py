@@ -1,18 +1,13 @@
 """Bytes over HTTP: each answer has those of its object, whole or in part."""
 
-import asyncio
 from collections.abc import Iterator
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import pytest
 from starlette.requests import Request
 
-from service.api import content
-from service.api.content import content_response, receive_upload
-from service.core.errors import StaleVersion, StalledRequest, UnsatisfiableRange
-from service.core.settings import Settings
+from service.api.content import content_response
+from service.core.errors import StaleVersion, UnsatisfiableRange
 from tests.support.service.web_app import await_in_thread
 
 WHOLE = {"first": b"0123456789", "second": b"abcdefgh"}
@@ -98,31 +93,3 @@ def test_each_file_has_its_own_version() -> None:
         with pytest.raises(StaleVersion):
             answer("second", if_match=other)
     assert answer("second", if_match="*").status_code == 200
-
-
-def test_a_sender_that_stops_loses_its_place(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    async def receive() -> dict[str, Any]:
-        if pieces:
-            return {"type": "http.request", "body": pieces.pop(), "more_body": True}
-        await asyncio.sleep(60)
-        raise AssertionError("nobody waits so long")
-
-    async def play(headers: list[tuple[bytes, bytes]]) -> None:
-        places = asyncio.Semaphore(1)
-        scope = {"type": "http", "method": "POST", "path": "/v1/datasets", "headers": headers}
-        for _ in range(2):
-            with pytest.raises(StalledRequest):
-                async with receive_upload(Request(scope, receive), settings, places):
-                    pass
-        assert not places.locked()
-
-    settings = Settings(data_dir=tmp_path)
-    monkeypatch.setattr(content, "MAX_PAUSE_SECONDS", 0.05)
-    for headers in (
-        [(b"content-type", b"text/csv")],
-        [(b"content-type", b"multipart/form-data; boundary=x"), (b"content-length", b"99")],
-    ):
-        pieces = [b"--x\r\n"]
-        await_in_thread(partial(play, headers))

@@ -9,6 +9,7 @@ from typing import Any, get_args
 import pytest
 from pydantic import ValidationError
 
+from service.core import settings as module
 from service.core.errors import Misconfigured
 from service.core.settings import Settings, is_loopback
 from service.jobs.job_schemas import JobIn
@@ -216,3 +217,15 @@ def test_another_connection_drops_no_lock_of_the_first(tmp_path: Path) -> None:
         locks = Path("/proc/locks").read_text().splitlines()
         assert [line for line in locks if all(part in line for part in mine)]
     database.dispose()
+
+
+@pytest.mark.parametrize(
+    ("gib", "uploads", "given", "expected"),
+    [(5, 4, None, 768), (100, 4, None, 4096), (1, 4, None, 512), (5, 4, 1000, 1000)],
+)
+def test_readers_of_uploads_share_the_memory(
+    monkeypatch: pytest.MonkeyPatch, gib: int, uploads: int, given: int | None, expected: int
+) -> None:
+    monkeypatch.setattr(module, "read_memory_bytes", lambda: gib * 2**30)
+    settings = Settings(max_uploads=uploads, reader_memory_mb=given)
+    assert settings.reader_memory_bytes // 2**20 == expected

@@ -240,6 +240,11 @@ def test_the_bounds_of_a_polynomial_are_told_as_the_cause() -> None:
     theta = np.array([values[one.name] for one in held.free_parameters])
     [only] = find_cause_in_bounds(held, theta, analyse_estimate(held, theta))
     assert (only.name, only.side, only.bound) == ("a[y(k-1)]", "upper", 0.5)
+    limit = {"physical": "upper"}
+    marked = Problem.build(
+        held.given_model, [record], parameters={"a[y(k-1)]": {"upper": 0.5, **limit}}
+    )
+    assert find_cause_in_bounds(marked, theta, analyse_estimate(marked, theta)) == ()
     free = Problem.build(parse_model(document(list(TRUTH))), [record])
     inside = theta.copy()
     assert find_cause_in_bounds(free, inside, analyse_estimate(free, inside)) == ()

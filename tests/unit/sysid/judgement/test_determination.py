@@ -33,6 +33,7 @@ def find(
     correlation: float = 0.0,
     groups: tuple[IdentifiableCombination, ...] = (),
     bounds: tuple[Any, ...] = (),
+    limits: str = "",
 ) -> list[Finding]:
     d = len(estimates)
     matrix = np.full((d, d), correlation)
@@ -48,7 +49,7 @@ def find(
         groups,
     )
     analysis = Analysis(estimates, uncertainty, 0.0, 0, Criteria(0.0, 0.0, 0.0, 9, 1))
-    analysis = replace(analysis, active_bounds=bounds)
+    analysis = replace(analysis, active_bounds=bounds, limits=frozenset(limits))
     return list(find_undetermined(problem, analysis, {"L"}, are_residuals_noise=are_noise))
 
 
@@ -96,6 +97,32 @@ def test_a_bound_that_the_data_push_against_is_serious_beside_residuals_that_are
     assert (quiet.severity, found.severity) == ("caution", "serious")
     assert "raise the bound of L" in found.advice
     assert "which the bound may cause" in found.text
+
+
+def test_a_bound_that_may_be_a_physical_limit_is_told_with_the_setting_that_says_so() -> None:
+    (low,) = find(K, make_estimate("L", "at bound", value=0.0))
+    assert low.advice.endswith(
+        "or set parameters: {L: {physical: lower}} if it is a physical limit."
+    )
+    (high,) = find(K, make_estimate("L", "at bound", value=5.0))
+    assert "set parameters: {L: {upper: 5, physical: upper}} if" in high.advice
+    both = find(*(make_estimate(name, "at bound", value=5.0) for name in "KL"))[0]
+    assert "{K: {upper: 5, physical: upper}} and parameters: {L: {upper" in both.advice
+    assert both.advice.endswith("if they are physical limits.")
+
+
+def test_an_estimate_at_a_physical_limit_is_a_note_unless_the_data_pull_it_over() -> None:
+    (held,) = find(K, make_estimate("T", value=5.0), limits="T")
+    assert (held.severity, held.parameters) == ("note", ("T",))
+    assert held.sentences == "T lies at its upper bound 5 s, a limit of the quantity"
+    pulled = make_estimate("T", "at bound", value=5.0)
+    (quiet,) = find(K, pulled, limits="T")
+    (found,) = find(K, pulled, limits="T", are_noise=False)
+    assert (quiet.severity, found.severity) == ("caution", "serious")
+    assert found.brief == "the data pull T over its physical limit"
+    assert "idden" not in found.sentences
+    grouped = make_estimate("T", "group", value=5.0)
+    assert "bound" not in [one.explanation for one in find(K, grouped, limits="T")]
 
 
 def test_a_lag_within_two_errors_of_0_may_be_0() -> None:

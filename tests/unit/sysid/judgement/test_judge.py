@@ -131,7 +131,7 @@ def test_a_run_that_diverges_explains_nothing(size: float, monkeypatch: pytest.M
         yield Candidate("curve of an actuator", "actuator", columns, "a curve", "a curve")
 
     expected = explain_line(LATE)
-    monkeypatch.setattr(judge, "_PROPOSERS", (*judge._PROPOSERS, propose_diverged))
+    monkeypatch.setattr(judge, "_CHEAP_PROPOSERS", (*judge._CHEAP_PROPOSERS, propose_diverged))
     assert explain_line(LATE) == expected
 
 
@@ -344,7 +344,7 @@ def propose_ramp(context: ResidualContext) -> Iterator[Candidate]:
 def use_proposers(
     monkeypatch: pytest.MonkeyPatch, *proposers: Callable[[ResidualContext], Iterator[Candidate]]
 ) -> None:
-    monkeypatch.setattr(judge, "_PROPOSERS", proposers)
+    monkeypatch.setattr(judge, "_CHEAP_PROPOSERS", proposers)
     monkeypatch.setattr(judge, "_FREE_PROPOSERS", ())
     monkeypatch.setattr(judge, "_COSTLY_PROPOSERS", ())
 

@@ -7,6 +7,8 @@ import pytest
 
 from sysid.data.records import Channel, Record
 from sysid.judgement.input_hold import (
+    HoldDoubt,
+    find_hold_doubts,
     find_other_readings,
     list_input_holds,
     replace_holds,
@@ -38,8 +40,9 @@ HELD = InputHold("u", "zero", "has two levels", "first", {"L": 2.3, "K": 2.005},
 LINES = InputHold("u", "first", "varies smoothly", "zero", {"L": 1.7, "K": 2.005}, 0.1)
 
 
-def find(hold: InputHold, doubt: str = "", rms: float = 0.1) -> list[Finding]:
-    return list(find_other_readings(PROBLEM, [hold], [doubt], [GAIN, LAG], rms, Simulations()))
+def find(hold: InputHold, doubt: str = "", gain: float = 0.0) -> list[Finding]:
+    doubts = [HoldDoubt(doubt, gain)]
+    return list(find_other_readings(PROBLEM, [hold], doubts, [GAIN, LAG], Simulations()))
 
 
 def test_a_reading_in_doubt_that_leaves_an_interval_makes_that_estimate_dependent() -> None:
@@ -61,7 +64,9 @@ def find_true_reading(bend: float, most: int | None = None) -> Finding:
     problem = Problem.build(load_model("fopdt"), [record])
     values = {**FAST.values, "x(0)": FAST.gain * float(u[0])}
     truth = InputHold("u", "zero", "has two levels", "zero", values, 0.09)
-    (found,) = find_other_readings(problem, [truth], ["It fits"], [LAG], 0.1, Simulations(most))
+    (found,) = find_other_readings(
+        problem, [truth], [HoldDoubt("It fits", 20.0)], [LAG], Simulations(most)
+    )
     return found
 
 
@@ -74,6 +79,27 @@ def test_a_reading_that_fits_clearly_better_is_the_advice_if_it_leaves_nothing_b
     assert find_true_reading(0.0, most=3).advice == ""  # nobody knows
 
 
+def test_a_smaller_rms_is_no_doubt_if_coloured_noise_explains_it() -> None:
+    """Another offset follows the slow noise, and gains 30 only if the noise were white."""
+    record = draw_record(FAST, 3, pole=0.98)
+    problem = Problem.build(load_model("fopdt"), [record])
+    values = {**FAST.values, "x(0)": FAST.gain * float(record.inputs[0].values[0])}
+    theta = np.array([values[name] for name in problem.free_names])
+    simulated = problem.predict(theta[None])[0]
+    offset = float(np.mean(problem.evaluator.measured - simulated))
+    other = InputHold(
+        "u", "zero", "has two levels", "zero", {**values, "y0": values["y0"] + offset}
+    )
+    rms = float(problem.evaluate_fitness(theta[None])[0])
+    held = replace(other, rms_other=rms * float(np.exp(-15.0 / problem.n_scored)))
+    (doubt,) = find_hold_doubts(problem, [held], theta, simulated, rms, Simulations())
+    assert doubt.text == ""
+    assert doubt.gain == pytest.approx(0.0, abs=1.0)
+    (doubt,) = find_hold_doubts(problem, [held], theta, simulated, rms, Simulations(3))
+    assert "fits better" in doubt.text  # not compared
+    assert doubt.gain == pytest.approx(30.0)
+
+
 def test_a_doubt_that_moves_nothing_is_a_note() -> None:
     (found,) = find(replace(LINES, estimates_other={"L": 2.001, "K": 2.0}), "It follows")
     assert (found.severity, found.parameters) == ("note", ())
@@ -83,8 +109,7 @@ def test_a_doubt_that_moves_nothing_is_a_note() -> None:
 def test_a_reading_that_is_likelier_makes_what_it_moves_dependent_inside_its_interval_too() -> None:
     moved = replace(LINES, estimates_other={"L": 1.985, "K": 2.005})  # by 1.5 and 0.5 of its error
     assert [one.severity for one in find(moved, "It fits better")] == ["note"]
-    likelier = 0.1 * np.exp(-9.0 / (2 * PROBLEM.n_scored))  # a gain of 9
-    (found,) = find(replace(moved, rms_other=float(likelier)), "It fits better")
+    (found,) = find(moved, "It fits better", gain=9.0)
     assert (found.severity, found.parameters) == ("caution", ("L",))
 
 
@@ -119,7 +144,7 @@ def test_jumps_between_irregular_samples_are_uncertain_by_a_period() -> None:
     record = Record((Channel("u", times, u),), (Channel("y", times, u),))
     problem = Problem.build(load_model("fopdt"), [record])
     notes = find_other_readings(
-        problem, list_input_holds(problem), [""], [GAIN, LAG], 0.1, Simulations()
+        problem, list_input_holds(problem), [HoldDoubt()], [GAIN, LAG], Simulations()
     )
     (found,) = (one for one in notes if one.explanation == "irregular sampling")
     period = float(found.text.rpartition(", ")[2].removesuffix(" s"))

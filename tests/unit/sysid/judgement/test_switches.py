@@ -52,3 +52,31 @@ def test_what_moves_in_a_gap_of_the_stamps_is_no_early_switch() -> None:
     is_earlier = moved.times < gapped.inputs[0].times
     assert is_earlier[jumps[jumps != last]].sum() > 0.9 * (jumps.size - 1)
     assert not is_earlier[last]
+
+
+def test_responses_of_changes_are_solved_as_a_dense_matrix() -> None:
+    random, groups, dense = np.random.default_rng(3), [], np.zeros((30, 9))
+    for number in range(3):  # each group shares rows with the next one, and with no other
+        rows, own = slice(8 * number, 8 * number + 14), slice(3 * number, 3 * number + 3)
+        dense[rows, own] = random.normal(size=(14, 3))
+        groups.append([(slice(0, 0), np.zeros((0, 3))), (rows, dense[rows, own])])
+    responses = switches._Responses(30, groups)
+    right, ridged = random.normal(size=(9, 2)), dense.T @ dense + 0.1 * np.eye(9)
+    solved, spread = responses.solve(0.1, right)
+    np.testing.assert_allclose(solved, np.linalg.solve(ridged, right))
+    assert spread == pytest.approx(np.linalg.slogdet(ridged)[1])
+    np.testing.assert_allclose(responses.respond(right[:, 0]), dense @ right[:, 0])
+    np.testing.assert_allclose(responses.project(dense), dense.T @ dense, atol=1e-12)
+    assert responses.largest >= np.linalg.norm(dense, 2) ** 2
+
+
+def test_of_too_many_changes_the_first_ones_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    context = build_context([CASE.draw(FAST, 1)], "fopdt", FAST.values)
+    monkeypatch.setattr(switches, "_MOST_PRODUCTS", 10**2 * context.times.size)
+    monkeypatch.setattr(switches, "_FEWEST_IN_GROUP", 1)
+    (found,) = switches.propose(context)
+    (u,), (moved,) = context.problem.records[0].inputs, found.change["records"][0].inputs
+    jumps = np.flatnonzero(np.diff(u.values)) + 1
+    early = (u.times - moved.times)[jumps] / STEP
+    np.testing.assert_allclose(early[10:], 0.5)
+    assert np.std(early[:10]) > 0.05

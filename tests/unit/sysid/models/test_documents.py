@@ -85,8 +85,9 @@ RICH = CONTINUOUS | {
         "c": {"lower": 0.1, "upper": 1, "unit": "N·s/m", "scale": "log", "bounds": "gain"},
         "L": {"lower": 0, "upper": 1, "unit": "s", "fixed": 0.5, "description": "a  pure delay"},
         "k": {"lower": 0, "upper": 2, "tied": "2*c"},
+        "r": {"lower": 0, "upper": 1, "physical": "both"},
     },
-    "equations": {"x": "v", "v": "(q(t) - c*v(t - L) - k*x)/m"},
+    "equations": {"x": "v", "v": "(q(t) - c*v(t - L) - k*x)/(r*m)"},
     "initial": {"x": {"lower": 0, "upper": 1, "bounds": "state"}, "v": "c"},
 }
 """With all that a parameter or an initial state may say."""
@@ -226,6 +227,31 @@ def test_a_tie_that_cannot_be_is_told_where_it_is(
     both = {"lower": 0, "upper": 1}
     found = list_faults(CONTINUOUS, parameters={"c": both, "L": both | entry})
     assert part in found[pointer]
+
+
+@pytest.mark.parametrize(
+    ("entry", "part"),
+    [
+        ({"physical": "above"}, "'above' is not"),
+        ({"physical": True}, "True is not"),
+        ({"physical": "upper", "bounds": "delay"}, "the upper bound follows the data"),
+        ({"physical": "lower", "bounds": "time"}, "the lower bound follows the data"),
+    ],
+)
+def test_a_physical_limit_that_cannot_be_is_told_where_it_is(
+    entry: dict[str, Any], part: str
+) -> None:
+    both = {"lower": 0, "upper": 1}
+    found = list_faults(CONTINUOUS, parameters={"c": both, "L": both | entry})
+    assert part in found["/parameters/L/physical"]
+
+
+def test_a_delay_that_the_data_bound_is_physically_not_below_0() -> None:
+    lag = {"lower": 0, "upper": 1, "bounds": "delay", "physical": "lower"}
+    model = parse_model(CONTINUOUS | {"parameters": {"c": {"lower": 0, "upper": 1}, "L": lag}})
+    assert model.parameters[1].is_physical("lower")
+    assert model.document["parameters"]["L"]["physical"] == "lower"
+    assert "physical" not in model.document["parameters"]["c"]
 
 
 def test_a_parameter_tied_in_its_document_is_not_free_until_something_else_is_said_of_it() -> None:

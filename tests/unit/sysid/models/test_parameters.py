@@ -1,6 +1,7 @@
 """Bounds and values of parameters, and delays inside them, at their very ends."""
 
 from math import inf
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,6 +53,39 @@ def test_one_bound_frees_no_fixed_parameter_and_both_do() -> None:
     fixed = (Parameter("a", 0.0, 1.0, fixed=0.5),)
     assert override_parameters(fixed, {"a": {"upper": 2.0}})[0].fixed == 0.5
     assert override_parameters(fixed, {"a": {"lower": 0.0, "upper": 2.0}})[0].is_free
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({}, "both"),
+        ({"lower": 0.1}, "upper"),
+        ({"upper": 0.9}, "lower"),
+        ({"lower": 0.1, "upper": 0.9}, None),
+        ({"lower": 0.0, "upper": 1}, "both"),
+        ({"lower": 0.1, "physical": "lower"}, "lower"),
+        ({"physical": "upper"}, "upper"),
+        ({"fixed": 0.5}, "both"),
+    ],
+)
+def test_a_bound_that_is_changed_is_no_physical_limit_unless_it_is_said(
+    change: dict[str, Any], expected: str | None
+) -> None:
+    (share,) = override_parameters((Parameter("s", 0.0, 1.0, physical="both"),), {"s": change})
+    assert share.physical == expected
+
+
+def test_a_bound_of_the_data_is_no_physical_limit_and_a_given_one_may_be() -> None:
+    gain = (Parameter("K", -9.0, 9.0, bounds="gain"),)
+    for side in ("lower", "upper", "both"):
+        with pytest.raises(InvalidSettings, match="follows the data, so it is no physical limit"):
+            override_parameters(gain, {"K": {"physical": side}})
+    (lower,) = override_parameters(gain, {"K": {"lower": 0.0, "physical": "lower"}})
+    assert (lower.lower, lower.physical) == (0.0, "lower")
+    delay = (Parameter("L", 0.0, 9.0, bounds="delay"),)
+    assert override_parameters(delay, {"L": {"physical": "lower"}})[0].is_physical("lower")
+    with pytest.raises(InvalidSettings, match="'above' is not 'lower', 'upper' or 'both'"):
+        override_parameters(delay, {"L": {"physical": "above"}})
 
 
 def test_estimated_starts_are_one_parameter_for_each_experiment() -> None:

@@ -1,5 +1,7 @@
 """Standard errors, correlations and identifiability, against theory and repetition."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -13,7 +15,7 @@ from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit, to_unit
 from sysid.simulation.simulate import simulate
 from sysid.uncertainty.analysis import analyse_estimate
-from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.estimates import AT_LIMIT, Estimate
 from tests.support.library.search_problems import COULOMB, DUFFING, example, force, noisy, record
 from tests.support.profiles import draw_seeds
 from tests.support.random_bounds import bound_count, bound_mean
@@ -201,13 +203,15 @@ def build_document(equation: str) -> dict[str, object]:
     }
 
 
-def analyse_equation(equation: str, theta: list[float]) -> dict[str, Estimate]:
+def analyse_equation(
+    equation: str, theta: list[float], **changes: dict[str, Any]
+) -> dict[str, Estimate]:
     model = load_model(build_document(equation))
     input_ = force(50)
     y = 0.9 * np.concatenate([[0.0], input_.values[:-1]])
     y = y + 0.1 * np.random.default_rng(0).standard_normal(50)
     output = record(y).outputs
-    problem = Problem.build(model, [Record((input_,), output)])
+    problem = Problem.build(model, [Record((input_,), output)], parameters=changes)
     return by_name(analyse_estimate(problem, np.array(theta)).estimates)
 
 
@@ -231,6 +235,15 @@ def test_an_estimate_at_its_bound_has_a_standard_error() -> None:
     assert found["h2"].status == "at bound"
     assert found["h2"].stderr is not None
     assert found["h2"].reason
+
+
+def test_an_estimate_at_a_physical_limit_is_identified_unless_the_data_pull_it_over() -> None:
+    equation, theta = "g*q(k-1) + h2*sin(k) + u*cos(2*k)", [0.9, 0.0, 0.1]
+    held = analyse_equation(equation, theta, h2={"physical": "lower"})["h2"]
+    assert (held.status, held.reason) == ("identified", AT_LIMIT)
+    assert analyse_equation(equation, theta, h2={"physical": "upper"})["h2"].status == "at bound"
+    low = {"upper": 0.3, "physical": "upper"}
+    assert analyse_equation(equation, [0.3, 0.1, 0.1], g=low)["g"].status == "at bound"
 
 
 def test_as_many_samples_as_parameters_give_no_standard_error() -> None:

@@ -181,6 +181,7 @@ def test_a_tied_parameter_has_the_widest_quantile_of_what_it_is_tied_to(
         (),
         np.zeros((0, 2)),
         np.ones(2),
+        np.zeros(2, dtype=np.bool_),
     )
     [estimate] = [e for e in make_estimates(problem, statistics) if e.name == "c"]
     slope = {"3*a": [3.0, 0.0], "3*b": [0.0, 3.0], "a + 2*b": [1.0, 2.0]}[tie]

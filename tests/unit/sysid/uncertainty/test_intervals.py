@@ -1,6 +1,7 @@
 """When an interval says little more than the bounds of its parameter."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,6 +57,27 @@ def test_an_interval_around_zero_that_covers_much_of_the_range_says_little(
     status, found = mark_interval(lower, upper, scale, interval)
     assert status == ("unidentifiable" if reason else "identified")
     assert found.startswith(reason) if reason else not found
+
+
+@pytest.mark.parametrize(
+    ("physical", "interval", "status"),
+    [
+        (None, (7.0, 18.0), "unidentifiable"),
+        ("upper", (7.0, 18.0), "identified"),
+        ("lower", (7.0, 18.0), "unidentifiable"),
+        ("lower", (2.0, 13.0), "identified"),
+        ("both", (2.0, 18.0), "unidentifiable"),
+    ],
+)
+def test_what_lies_beyond_a_physical_limit_does_not_make_an_interval_wide(
+    physical: str | None, interval: Interval, status: str
+) -> None:
+    change: dict[str, Any] = {"lower": 5.0, "upper": 15.0}
+    change |= {"physical": physical} if physical else {}
+    problem = PROBLEM.rebuild(parameters={ESTIMATE.name: change})
+    wide = replace(ESTIMATE, interval95=interval)
+    (marked,) = mark_poor_intervals(problem.free_parameters, [wide])
+    assert marked.status == status
 
 
 def test_an_interval_of_one_degree_of_freedom_is_not_identified_and_stays_in_the_bounds() -> None:

@@ -17,7 +17,7 @@ from sysid.residuals.series import make_whitening
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
-from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.estimates import AT_LIMIT, Estimate
 from sysid.uncertainty.intervals import ProfileEnds, compose_intervals
 from sysid.uncertainty.profile_ends import FoundEnds, extrapolate_ends, find_profile_ends
 from tests.support.library.small_models import LINE
@@ -118,6 +118,20 @@ def test_a_record_that_ends_too_early_leaves_gain_and_time_constant_open_above()
     assert gain.reason.endswith("fit, where T meets its bound")  # both grow together
     for one in (gain, time):
         assert (one.status, one.open_ends) == ("unidentifiable", ("upper",))
+
+
+def test_an_end_at_a_physical_limit_is_closed_also_where_another_parameter_meets_it() -> None:
+    searched, theta = solve_decay(1.0)
+    problem = searched.rebuild(parameters={"T": {"physical": "upper"}})
+    found, analysis = find(problem, theta)
+    assert all(ends.is_closed and ends.meets_limit for ends in found.by_name.values())
+    gain, time = compose_intervals(analysis.estimates, found.by_name)
+    assert time.interval95 is not None
+    assert time.interval95[1] == time.upper
+    for one in (gain, time):
+        assert (one.status, one.open_ends, one.reason) == ("identified", (), "")
+    below = searched.rebuild(parameters={"T": {"physical": "lower"}})
+    assert {*find(below, theta)[0].by_name["T"].limits} == {"upper"}
 
 
 @pytest.mark.parametrize("pole", [0.0, 0.7])
@@ -259,6 +273,17 @@ def test_a_closed_profile_identifies_what_the_linear_model_does_not() -> None:
     assert found.stderr == pytest.approx(1.0 / np.sqrt(12.0))
     (kept,) = compose_intervals([vague], {"L": ProfileEnds((8.5, 15.0), is_closed=False)})
     assert (kept.status, kept.stderr, kept.interval95) == ("unidentifiable", 20.0, (8.5, 15.0))
+
+
+def test_a_closed_profile_shows_that_there_is_no_combination_beside_a_limit_alone() -> None:
+    member = Estimate("r", "1", 1.0, 0.05, 1.0, None, None, "group", "only a combination")
+    beside = ProfileEnds((0.8, 1.0), meets_limit=True)
+    (found,) = compose_intervals([member], {"r": beside})
+    assert (found.status, found.reason, found.interval95) == ("identified", AT_LIMIT, (0.8, 1.0))
+    assert found.stderr == pytest.approx(0.2 / np.sqrt(12.0))
+    for ends in (replace(beside, meets_limit=False), replace(beside, is_closed=False)):
+        (kept,) = compose_intervals([member], {"r": ends})
+        assert (kept.status, kept.stderr) == ("group", None)
 
 
 @pytest.mark.parametrize(
