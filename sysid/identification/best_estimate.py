@@ -55,6 +55,7 @@ from sysid.judgement.starts import (
     compare_starts,
 )
 from sysid.judgement.unrecorded_input import RecordedComparison, compare_where_recorded
+from sysid.judgement.unstable_run import MIN_GROWTH, compute_growth
 from sysid.minima.local_minima import (
     LocalMinima,
     count_affordable_simulations,
@@ -418,7 +419,9 @@ class _EstimateSearch:
         return True
 
     def _has_feedback(self) -> bool:
-        """Whether an input follows the residuals."""
+        """Whether an input follows the residuals, or the plant is unstable: it has a controller."""
+        if compute_growth(self.problem, self.theta) >= MIN_GROWTH:
+            return True
         simulated = self.problem.predict(self.theta[None])[0]
         return any(find_feedback(self.problem, simulated, self.analysis))
 
