@@ -159,6 +159,7 @@ def _write(
     bounds: Mapping[str, tuple[float, float]],
     inputs: Sequence[str] = ("u",),
     initial: Mapping[str, Any] | None = None,
+    plant: Sequence[str] = (),
 ) -> Model:
     return parse_model(
         {
@@ -174,6 +175,9 @@ def _write(
             "outputs": {"y": output},
             "initial": dict(initial or dict.fromkeys(states, 0)),
             "solver": {"substeps": 2},
+            "noise": {"plant": dict.fromkeys(plant, "estimate")}
+            if plant
+            else {"load": {inputs[0]: "estimate"}},
         }
     )
 
@@ -304,6 +308,7 @@ KINDS: dict[str, Kind] = {
             {"Ri": (0.1, 20), "Ra": (0.1, 40), "Ci": (0.1, 20), "Ce": (0.5, 200)},
             ("u", "v"),
             {"x": {"lower": -5, "upper": 5}, "w": {"lower": -5, "upper": 5}},
+            ("x", "w"),
         ),
         THERMAL,
         _rate_thermal,

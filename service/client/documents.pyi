@@ -1043,7 +1043,7 @@ class LossInDocument(TypedDict):
     """what is minimised; `soft-l1` limits the influence of outliers"""
     scale: NotRequired[float]
     """residual beyond which `soft-l1` grows linearly, in the output's unit"""
-    noise_model: NotRequired[Literal["auto", "white", "ar1", "plant", "load"]]
+    noise_model: NotRequired[Literal["auto", "white", "ar1", "plant", "load", "drift"]]
     """noise model of the estimates"""
 
 class MarginsDocument(TypedDict):
@@ -1243,7 +1243,7 @@ class OrderComparisonDocument(TypedDict):
     """unit of the dead times"""
     delay_range: list[float | None]
     """smallest and largest dead time of the open orders, in `unit`"""
-    noise_model: Literal["white", "ar1"]
+    noise_model: Literal["white", "ar1", "plant", "load", "drift"]
     """noise model of the criteria"""
     fits: list[OrderFitDocument]
     """the orders, the lowest first"""
@@ -1667,7 +1667,7 @@ class RunDocument(TypedDict):
         Literal["white", "first-order", "coloured", "drifting", "clustered"] | None
     ]
     """colour of the residuals that the errors assume. If they drift over the whole record, the errors are lower bounds"""
-    noise_model: NotRequired[Literal["white", "ar1", "plant", "load"] | None]
+    noise_model: NotRequired[Literal["white", "ar1", "plant", "load", "drift"] | None]
     """noise model of the estimates"""
     correlation_times: NotRequired[dict[str, float | None] | None]
     """correlation time of each output's noise, s, where the noise model has one"""

@@ -28,14 +28,17 @@ TopologyName = Literal["one-way-ring", "ring", "fully-connected", "star", "uncon
 SequenceKind = Literal["paper", "adaptive"]
 PredictionKind = Literal["simulation", "one-step"]
 LossKind = Literal["squares", "soft-l1"]
-NoiseModel = Literal["auto", "white", "ar1", "plant", "load"]
-FoundNoiseModel = Literal["white", "ar1", "plant", "load"]
+NoiseModel = Literal["auto", "white", "ar1", "plant", "load", "drift"]
+FoundNoiseModel = Literal["white", "ar1", "plant", "load", "drift"]
+PlantNoise = Literal["plant", "load", "drift"]
+"""Noise that a Kalman filter follows."""
 StartKind = Literal["rest", "free", "measured"]
 InitialSetting = Literal["rest", "free", "measured", "auto"]
 SEARCH_METHODS: tuple[SearchMethod, ...] = get_args(SearchMethod)
 PREDICTION_KINDS: tuple[PredictionKind, ...] = get_args(PredictionKind)
 LOSS_KINDS: tuple[LossKind, ...] = get_args(LossKind)
 NOISE_MODELS: tuple[NoiseModel, ...] = get_args(NoiseModel)
+FILTERED: tuple[PlantNoise, ...] = get_args(PlantNoise)
 INITIAL_SETTINGS: tuple[InitialSetting, ...] = get_args(InitialSetting)
 MIN_POPULATION = 4
 """Fewest individuals of an island: two parents, and others for their children to replace."""
@@ -325,8 +328,9 @@ class Loss:
     under first-order noise gives the estimates
     (`sysid.noise_models.generalised_least_squares`). ``auto`` selects ``ar1`` for free runs by
     squares whose coloured residuals have no other explanation (`sysid.judgement.judge`), else
-    ``white``. ``plant`` and ``load`` are noise inside the plant: the likelihood of a Kalman filter
-    is maximised (`sysid.models.kalman_filter`). With `noise` in the document, ``auto`` does that.
+    ``white``. ``plant`` and ``load`` are noise inside the plant, and ``drift`` is that of a sensor:
+    the likelihood of a Kalman filter is maximised (`sysid.models.kalman_filter`). With `noise` in
+    the document, ``auto`` does that if it is likelier (`sysid.identification.plant_noise_choice`).
 
     Attributes
     ----------

@@ -7,7 +7,10 @@ it (`integration_step`). At last residuals that are not white get a noise model
 (`generalised_least_squares`). The champions of the paper's two methods are analysed as they are.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import inf
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +23,11 @@ from sysid.identifiability.exchange import (
 )
 from sysid.identification.budget import Budget
 from sysid.identification.deadline import Deadline
+from sysid.identification.plant_noise_choice import (
+    ReplacedRun,
+    fit_filters,
+    fit_first_order_criterion,
+)
 from sysid.identification.state_conversion import convert_state
 from sysid.islands.run_state import RunState
 from sysid.islands.stopping import count_restarts
@@ -34,6 +42,8 @@ from sysid.judgement.integration_step import (
     mark_changing,
 )
 from sysid.judgement.judge import Explained, explain_if_noise, explain_residuals
+from sysid.judgement.levels import STRONG_ODDS
+from sysid.judgement.noise_findings import find_feedback
 from sysid.judgement.residual_context import (
     ResidualContext,
     Simulations,
@@ -45,6 +55,7 @@ from sysid.judgement.starts import (
     compare_starts,
 )
 from sysid.judgement.unrecorded_input import RecordedComparison, compare_where_recorded
+from sysid.judgement.unstable_run import MIN_GROWTH, compute_growth
 from sysid.minima.local_minima import (
     LocalMinima,
     count_affordable_simulations,
@@ -139,6 +150,8 @@ class BestEstimate:
         The start that the estimate assumes, and the others; None if they were not compared.
     state : RunState
         The search, with the parameters of `problem`.
+    free_run : ReplacedRun or None
+        The estimate by squares, if a filter was chosen instead.
     """
 
     problem: Problem
@@ -150,6 +163,7 @@ class BestEstimate:
     explained: Explained
     starts: StartComparison | None
     state: RunState
+    free_run: ReplacedRun | None
 
     @property
     def lowest_end(self) -> IslandEnd:
@@ -187,27 +201,16 @@ def find_best_estimate(
     search = _EstimateSearch(
         problem, state, budget, deadline, refines=refines, compares_starts=explains
     )
-    search.choose_start()
-    first: tuple[Estimate, ...] = ()
-    limit = ""
-    while True:
-        search.analyse_best()
-        half = search.compare_half_step()
-        if half is None or not half.changes:
-            if search.choose_start():
-                continue
-            break
-        estimates = search.analysis.estimates
-        limit = search.use_half_step(half)
-        if limit:
-            if search.choose_start():
-                continue
-            break
-        first = first or estimates
-    changes = {} if half is None else half.changes
+    steps = _settle_steps(search)
     recorded = search.compare_where_recorded()  # a noise model would hide a contradiction
     explained = search.explain(explains=explains)
-    noise = search.apply_noise_model(explained, is_settled=not changes)
+    if search.use_plant_noise(explained):
+        steps = _settle_steps(search)
+        recorded = search.compare_where_recorded()
+        explained = search.explain(explains=explains)
+    first, half, limit = steps
+    is_settled = half is None or not half.changes
+    noise = search.apply_noise_model(explained, is_settled=is_settled)
     minima = search.collect_minima(recorded)
     if explains and refines:
         search.follow_profiles(noise.theta)
@@ -226,7 +229,36 @@ def find_best_estimate(
         explained,
         search.starts,
         search.state,
+        search.free_run,
     )
+
+
+class _SettledSteps(NamedTuple):
+    """The estimates before the step was halved, the last comparison, and what forbade another."""
+
+    first: tuple[Estimate, ...]
+    half: HalfStep | None
+    limit: str
+
+
+def _settle_steps(search: "_EstimateSearch") -> _SettledSteps:
+    """Analyse the best estimate, and halve the step until estimates and errors stand still."""
+    search.choose_start()
+    first: tuple[Estimate, ...] = ()
+    while True:
+        search.analyse_best()
+        half = search.compare_half_step()
+        if half is None or not half.changes:
+            if search.choose_start():
+                continue
+            return _SettledSteps(first, half, "")
+        estimates = search.analysis.estimates
+        limit = search.use_half_step(half)
+        if limit:
+            if search.choose_start():
+                continue
+            return _SettledSteps(first, half, limit)
+        first = first or estimates
 
 
 class _EstimateSearch:
@@ -254,6 +286,7 @@ class _EstimateSearch:
         self._initial = problem.settings.initial
         self._left: list[StartKind | None] = []
         self.starts: StartComparison | None = None
+        self.free_run: ReplacedRun | None = None
         self._deadline, self._refines = deadline, refines
         is_asked = compares_starts or self._initial == "auto"
         self._compares_starts = refines and is_asked
@@ -354,13 +387,58 @@ class _EstimateSearch:
 
     def _use_start(self, best: FittedStart) -> None:
         """Continue with another start from the ends of all islands."""
-        before, self.problem, self._scanned = self.problem, best.problem, None
-        self.state = convert_state(before, best.problem, self.state)
-        points = [convert_point(before, best.problem, end.theta) for end in self.ends]
-        points[self._best] = best.theta
-        values = best.problem.evaluate_fitness(np.array(points))
+        self._continue_with(best.problem, best.theta)
+
+    def use_plant_noise(self, explained: Explained) -> bool:
+        """Take a filter if noise inside the plant is likelier than what explains the residuals.
+
+        It is as ordinary as the free run, so it takes strong odds. What was found has those of a
+        defect, but for a closed loop, in which noise is a part of the input. The states may start
+        otherwise beside a filter.
+        """
+        problem = self.problem
+        if not self._may_choose_noise() or explained.criterion == -inf:
+            return False
+        ends = [one.theta for one in self.ends]
+        known = (self.theta, *ends, *(one.theta for one in self._fits))
+        most, late = self._budget.count_left(self._reserved), self._deadline.is_past_grace
+        found = fit_filters(problem, known, most, late)
+        if found is None:
+            return False
+        first_order, spent = fit_first_order_criterion(problem, self.theta)
+        self._budget.spend(found.evaluations + spent)
+        gain = min(explained.criterion, first_order) - found.criterion
+        has_rival = gain <= STRONG_ODDS + max(explained.odds, 0.0)
+        if gain <= STRONG_ODDS or (has_rival and not self._has_feedback()):
+            return False
+        values = dict(zip(problem.free_names, self.theta.tolist(), strict=True))
+        self.free_run = ReplacedRun(values, gain)
+        self.starts, self._left = None, []
+        equal = found.problem.rebuild(deviations=None)
+        self._continue_with(equal, found.theta, found.sizes)
+        return True
+
+    def _has_feedback(self) -> bool:
+        """Whether an input follows the residuals, or the plant is unstable: it has a controller."""
+        if compute_growth(self.problem, self.theta) >= MIN_GROWTH:
+            return True
+        simulated = self.problem.predict(self.theta[None])[0]
+        return any(find_feedback(self.problem, simulated, self.analysis))
+
+    def _continue_with(
+        self, problem: Problem, theta: FloatArray, added: Mapping[str, float] | None = None
+    ) -> None:
+        """Continue with another problem from its estimate (D,), and from the ends of all islands.
+
+        `added` are values of parameters that only that problem has.
+        """
+        before, self.problem, self._scanned = self.problem, problem, None
+        self.state = convert_state(before, problem, self.state, added)
+        points = [convert_point(before, problem, end.theta, added) for end in self.ends]
+        points[self._best] = theta
+        values = problem.evaluate_fitness(np.array(points))
         most = self._budget.count_left(self._reserved)
-        candidates = refine_candidates(best.problem, points, most, self._deadline.is_past_grace)
+        candidates = refine_candidates(problem, points, most, self._deadline.is_past_grace)
         self.ends = [
             self._continue_end(replace(end, theta=point, rms=rms), candidate)
             for end, point, rms, candidate in zip(
@@ -417,7 +495,7 @@ class _EstimateSearch:
 
         Explanations that budget and time do not allow are left out.
         """
-        if not (explains or self._may_be_ar1()):
+        if not (explains or self._may_choose_noise()):
             return Explained()
         left = self._budget.count_left(self._reserved)
         simulations = Simulations(left, self._deadline.is_past_grace)
@@ -438,7 +516,7 @@ class _EstimateSearch:
             return squares._replace(is_complete=requested != "ar1")
         if requested == "ar1":
             return self._use_noise_model()
-        if not (is_settled and self._may_be_ar1() and explained.is_noise):
+        if not (is_settled and self._may_choose_noise() and explained.is_noise):
             return squares
         before = self.analysis
         estimate = self._use_noise_model()
@@ -447,7 +525,7 @@ class _EstimateSearch:
         self.analysis = before
         return squares
 
-    def _may_be_ar1(self) -> bool:
+    def _may_choose_noise(self) -> bool:
         """Whether the residuals of a free run by squares are coloured: else there is no choice."""
         problem, uncertainty = self.problem, self.analysis.uncertainty
         is_free = problem.is_free_run and problem.loss.kind == "squares"

@@ -1,15 +1,17 @@
 """Conclude a search: refinement, uncertainty, validation, warnings."""
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from math import inf
 
 import numpy as np
 
-from sysid.core.errors import DivergedEverywhere, NothingIdentifiable
+from sysid.core.errors import DivergedEverywhere, NothingIdentifiable, SysidError
 from sysid.core.jit import read_clock
 from sysid.core.settings import FoundNoiseModel, GeneticAlgorithm, StartKind
 from sysid.core.threads import use_one_thread
+from sysid.core.types import FloatArray
 from sysid.data.records import find_common_sample_time
 from sysid.identifiability.exchange import describe_exchanges
 from sysid.identification.best_estimate import IslandEnd, find_best_estimate, is_refining
@@ -41,7 +43,12 @@ from sysid.judgement.input_hold import (
 from sysid.judgement.integration_step import find_finer_step
 from sysid.judgement.judge import select_explanations
 from sysid.judgement.levels import SOLVER_SHARE
-from sysid.judgement.noise_findings import find_feedback, find_noise_model, find_unexplained
+from sysid.judgement.noise_findings import (
+    find_feedback,
+    find_noise_model,
+    find_plant_noise,
+    find_unexplained,
+)
 from sysid.judgement.open_terms import find_open_terms
 from sysid.judgement.preparation import (
     find_early_responses,
@@ -55,21 +62,27 @@ from sysid.judgement.settling import find_rough_end, find_unsettled
 from sysid.judgement.starts import StartComparison, find_open_starts
 from sysid.judgement.unrecorded_input import find_unrecorded_input
 from sysid.judgement.unstable_run import (
+    MIN_GROWTH,
     compare_one_step,
+    compute_growth,
     find_misled_run,
 )
 from sysid.judgement.validation import find_contradictions, split_outputs, validate_estimates
-from sysid.judgement.yardstick import fit_yardstick
+from sysid.judgement.yardstick import Yardstick, fit_yardstick
 from sysid.minima.minima import mark_ambiguous
 from sysid.minima.search_evidence import assess_search, is_explained
 from sysid.noise_models.generalised_least_squares import resolve_noise_model
+from sysid.residuals.feedback import describe_feedback
 from sysid.residuals.onset_delay import estimate_onset_delays
-from sysid.residuals.residual_tests import run_residual_tests
+from sysid.residuals.residual_tests import list_residual_series, run_residual_tests
 from sysid.results.findings import Finding, note
 from sysid.results.identification import Identification
 from sysid.results.result import Agreements, FitPercent, Identifiability, KnownBefore
+from sysid.search.refine import refine_candidates
 from sysid.search.state import Improvement, IslandSummary
+from sysid.simulation.free_run import convert_to_free_run
 from sysid.simulation.problem import Problem, compute_metrics
+from sysid.simulation.start_values import convert_point
 from sysid.uncertainty.estimates import CorrelationMatrix, Uncertainty
 from sysid.uncertainty.posterior import describe_posterior, sample_posterior
 from sysid.uncertainty.unequal_noise import describe_unequal_noise
@@ -195,6 +208,8 @@ def _build_identification(
     # Beside white residuals nothing is better, and in a loop the controller's inverse is.
     measures = compares_orders and not (is_white or is_of_the_solver or feedback)
     yardstick = fit_yardstick(problem, simulated) if measures else None
+    if compares_orders and not problem.is_free_run:
+        yardstick = _measure_free_run(problem, theta)
     # A sweep's run tries no setting: that is done when somebody opens it.
     left = budget.count_left() if compares_orders else 0
     simulations = Simulations(left, deadline.is_past_grace)
@@ -261,6 +276,7 @@ def _build_identification(
                 best.lowest_end.theta,
                 is_complete=noise.is_complete,
             ),
+            *(() if best.free_run is None else find_plant_noise(problem, *best.free_run)),
             *_list_notes(
                 "posterior", () if posterior is None else describe_posterior(posterior, estimates)
             ),
@@ -329,6 +345,29 @@ def _build_identification(
     )
 
 
+def _measure_free_run(problem: Problem, theta: FloatArray) -> Yardstick | None:
+    """Compare the free run beside a filter with a linear black box, but in a loop.
+
+    It is fitted by squares first, from estimated starts if it may have them. The comparison is safe
+    because the model was fitted to the samples that it is compared on. An unstable plant is
+    recorded in a loop, and its free run is of no use.
+    """
+    if not problem.model.corrections:
+        return None
+    free, point = convert_to_free_run(problem, theta)
+    if compute_growth(free, point) >= MIN_GROWTH:
+        return None
+    started = free
+    with suppress(SysidError):  # some model has no such start
+        started = free.rebuild(initial="free")
+    free, point = started, convert_point(free, started, point)
+    (end,) = refine_candidates(free, [point])
+    simulated = free.predict((point if end is None else end.theta)[None])[0]
+    if describe_feedback(list_residual_series(free, simulated)):
+        return None
+    return fit_yardstick(free, simulated)
+
+
 def _describe_identifiability(uncertainty: Uncertainty | None) -> Identifiability:
     if uncertainty is None:
         return Identifiability(None, (), np.zeros(0))
@@ -346,7 +385,7 @@ def _get_start(asked: Problem, starts: StartComparison | None) -> StartKind | No
 def _get_noise_model(problem: Problem, times: Mapping[str, float]) -> FoundNoiseModel:
     """Get the noise model of the estimates; ``ar1`` was not taken where no noise is coloured."""
     asked = problem.loss.noise_model
-    if asked == "plant" or asked == "load":
+    if asked == "plant" or asked == "load" or asked == "drift":
         return asked
     return "ar1" if any(times.values()) else "white"
 

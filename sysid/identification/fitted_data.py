@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sysid.core.settings import FILTERED
 from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
@@ -31,6 +32,8 @@ def collect_fitted_data(
         else (validation_problem, result.simulated_validation)
     )
     counts = {}
+    if result.noise_model in FILTERED:
+        problem = problem.rebuild(loss=replace(problem.loss, noise_model=result.noise_model))
     if not problem.is_free_run and validation_problem is None:
         counts = count_past_output_coefficients(problem.model, problem.all_parameters)
     series = list_residual_series(

@@ -10,10 +10,10 @@ import numpy as np
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
-from sysid.identification.plant_noise import build_free_run
 from sysid.search.island import compute_start_budget, get_island_settings
 from sysid.search.refine import refine_candidates
 from sysid.selection.starts import SearchStarts
+from sysid.simulation.free_run import build_free_run
 from sysid.simulation.noise_levels import add_noise_levels
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit

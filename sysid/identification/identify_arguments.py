@@ -26,6 +26,7 @@ from sysid.models.channel_assignment import (
     assign_recording,
     check_holds,
 )
+from sysid.models.kalman_filter import is_noise_parameter
 from sysid.models.model import Model
 from sysid.residuals.onset_delay import find_unprompted_output
 
@@ -182,7 +183,7 @@ def _describe_wrong_data(data: object) -> str:
 
 
 def check_warm(warm: Mapping[str, float] | None, known: Sequence[str]) -> None:
-    """Check the values that the search starts from.
+    """Check the values that the search starts from; sizes of noise may be of a chosen filter.
 
     Raises
     ------
@@ -190,7 +191,7 @@ def check_warm(warm: Mapping[str, float] | None, known: Sequence[str]) -> None:
         If a name is no parameter, or a value is no finite number.
     """
     for name, value in (warm or {}).items():
-        if name not in known:
+        if name not in known and not is_noise_parameter(name):
             detail = f"there is no parameter {name!r}{suggest_name(str(name), known)}"
             raise InvalidSettings(join_pointer("warm", str(name)), detail)
         if not _is_number(value) or not isfinite(value):

@@ -1,7 +1,6 @@
 """What a filter says of noise: the size of each source, and the free run beside the predictions."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from math import exp, isfinite, log
 
 import numpy as np
@@ -10,6 +9,7 @@ from sysid.core.types import FloatArray
 from sysid.core.units import is_blank_unit
 from sysid.models.kalman_filter import is_noise_parameter
 from sysid.results.parts import NoiseSource, PlantNoise
+from sysid.simulation.free_run import simulate_free_run
 from sysid.simulation.problem import Problem, compute_metrics
 
 
@@ -26,22 +26,13 @@ def describe_plant_noise(problem: Problem, theta: FloatArray, rms: float) -> Pla
     _, deviations = problem.predict_ahead(theta[None])
     mean = np.mean(np.log(deviations[0, problem.scored_rows]))
     sensor = exp(log(rms) - float(mean)) if rms > 0 else 0.0
-    free = build_free_run(problem)
-    own = np.array([[values[name] for name in free.free_names]])
-    metrics = compute_metrics(free, free.predict(own)[0])
+    metrics = compute_metrics(*simulate_free_run(problem, theta))
     is_finite = isfinite(metrics.rms)
     return PlantNoise(
         tuple(_list_sources(problem, values, sensor)),
         metrics.rms if is_finite else None,
         metrics.fit_percent if is_finite else None,
     )
-
-
-def build_free_run(problem: Problem) -> Problem:
-    """Build the problem whose outputs follow from the inputs alone, with the same parameters."""
-    settings = problem.settings
-    kept = {name: one for name, one in settings.parameters.items() if not is_noise_parameter(name)}
-    return problem.rebuild(loss=replace(settings.loss, noise_model="white"), parameters=kept)
 
 
 def _list_sources(

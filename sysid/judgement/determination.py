@@ -10,6 +10,7 @@ from sysid.core.types import RANK_TOLERANCE
 from sysid.core.units import format_unit
 from sysid.identifiability.combinations import IdentifiableCombination
 from sysid.judgement.levels import NOTABLE_MOVE, SEPARABLE
+from sysid.models.kalman_filter import is_noise_parameter
 from sysid.models.parameters import BoundSide, Parameter
 from sysid.results.findings import Finding, Severity, note
 from sysid.simulation.problem import Problem
@@ -23,8 +24,13 @@ _VAGUE_SHARE = 0.5  # of its value: standard error from which a group is practic
 def find_undetermined(
     problem: Problem, analysis: Analysis, delays: set[str], *, are_residuals_noise: bool
 ) -> Iterator[Finding]:
-    """Find what the data do not determine: alone, in combination, or beyond a bound."""
-    free, known = [one for one in analysis.estimates if one.is_free], analysis.uncertainty
+    """Find what the data do not determine: alone, in combination, or beyond a bound.
+
+    Sizes of noise that they leave open are a note: intervals of the others average over them.
+    """
+    free = [e for e in analysis.estimates if e.is_free and not is_noise_parameter(e.name)]
+    known = analysis.uncertainty
+    yield from _find_open_noise(analysis.estimates)
     yield from _find_bounds(problem, analysis, free, are_residuals_noise=are_residuals_noise)
     yield from _find_limits(analysis, free, are_residuals_noise=are_residuals_noise)
     yield from _find_unidentifiable(free, () if known is None else known.groups)
@@ -33,6 +39,23 @@ def find_undetermined(
         yield from _find_insignificant(free, delays)
         yield from _find_vague_groups(known.groups)
         yield from _find_inseparable(known, free, delays)
+
+
+def _find_open_noise(estimates: Sequence[Estimate]) -> Iterator[Finding]:
+    open_sizes = [
+        one
+        for one in estimates
+        if is_noise_parameter(one.name) and one.is_free and one.status != "identified"
+    ]
+    if open_sizes:
+        names = join_names([one.name for one in open_sizes])
+        reasons = "; ".join(f"{one.name}: {one.reason or one.status}" for one in open_sizes)
+        yield note(
+            "size of noise",
+            "noise",
+            f"the data leave {names} open ({reasons}). Intervals of the other parameters allow "
+            "for it",
+        )
 
 
 def find_ambiguous(estimates: Sequence[Estimate]) -> Iterator[Finding]:
@@ -62,9 +85,9 @@ def _find_bounds(
 ) -> Iterator[Finding]:
     """Find estimates at a bound of the search; it may be why residuals are not noise."""
     bounded = [one for one in free if one.status == "at bound" and one.name not in analysis.limits]
-    if not bounded and not analysis.active_bounds:
+    active = [one for one in analysis.active_bounds if not is_noise_parameter(one.name)]
+    if not bounded and not active:
         return
-    active = analysis.active_bounds
     names = [bound.name for bound in active] or [one.name for one in bounded]
     lies = "lies at its bound" if len(names) == 1 else "lie at their bounds"
     texts = [str(bound) for bound in active]

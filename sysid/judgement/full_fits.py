@@ -15,7 +15,7 @@ import numpy as np
 from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
 from sysid.data.records import Record, keep_outputs
-from sysid.judgement.residual_context import ResidualContext, find_held
+from sysid.judgement.residual_context import ResidualContext, find_held, hold_noise
 from sysid.judgement.residual_model import ResidualModel
 from sysid.judgement.unrecorded_input import compute_reach
 from sysid.residuals.series import iterate_parts
@@ -136,7 +136,7 @@ def _assess(
     """Assess the fit of a problem at a point (D',), beside columns (n, q) of samples left out."""
     sensitivities = compute_sensitivities(problem, theta)
     context.simulations.spent += sensitivities.evaluations
-    residuals, columns = -sensitivities.residuals, sensitivities.columns
+    residuals, columns = -sensitivities.residuals, hold_noise(problem, sensitivities.columns)
     is_held = find_held(problem, theta, residuals, columns)
     parts, d = list(iterate_parts(problem)), theta.size
     fit = ResidualModel(residuals, np.where(is_held, 0.0, columns), parts).fit(dummies)
@@ -216,7 +216,8 @@ def _fit_span(context: ResidualContext, begin: float, end: float) -> _FittedPart
     context.simulations.spent += found.evaluations + slopes.evaluations
     is_part = (context.times >= begin) & (context.times < end)
     residuals = np.where(is_part, -slopes.residuals, 0.0)
-    return _FittedPart(found.theta, residuals, np.where(is_part[:, None], slopes.columns, 0.0))
+    columns = hold_noise(context.problem, slopes.columns)
+    return _FittedPart(found.theta, residuals, np.where(is_part[:, None], columns, 0.0))
 
 
 def _compare_parts(

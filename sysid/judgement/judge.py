@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +62,7 @@ _COSTLY_PROPOSERS: tuple[_Proposer, ...] = (
     switches.propose,
 )
 """Each of their explanations takes a simulation: only if the residuals depend on anything."""
+_AGAINST_DEFECTS = DEFECT_GAIN - STRONG_ODDS  # a record in twenty has one
 _LIKELY = 0.01  # of the ratio of one candidate: then the costly ones are looked at as well
 _BY_ORDER = ("one more time constant", "filter of a sensor")  # another order is the full fit
 _SETTABLE = ("order", "reading of an input", "start")  # their advice is a setting
@@ -84,14 +86,26 @@ class _Scored(NamedTuple):
 class Explained(NamedTuple):
     """Findings about residuals; `is_done`: whether all explanations were looked for.
 
-    `is_doubtful`: something has strong odds against noise alone, but not those of a defect. Or
-    not all were looked for. `is_of_the_solver`: the residuals are errors of the integration.
+    Attributes
+    ----------
+    is_doubtful : bool
+        Whether something has strong odds against noise alone, but not those of a defect. Or not all
+        were looked for.
+    is_of_the_solver : bool
+        Whether the residuals are errors of the integration.
+    criterion : float
+        Schwarz's criterion of coloured noise alone; minus infinity if it was not computed.
+    odds : float
+        Twice the logarithm of the odds of what was found against that, as a record in twenty has a
+        defect; 0 if nothing was.
     """
 
     findings: tuple[Finding, ...] = ()
     is_done: bool = False
     is_doubtful: bool = False
     is_of_the_solver: bool = False
+    criterion: float = -inf
+    odds: float = 0.0
 
     @property
     def is_noise(self) -> bool:
@@ -134,7 +148,9 @@ def explain_if_noise(context: ResidualContext) -> Explained:
         scored = _order([*scored, *_score_at_once(context, proposers)])
         is_likely = bool(scored) and scored[0].gain > STRONG_ODDS
         if is_likely and _describe(context, scored[0], None, ()).parameters:
-            return Explained(is_doubtful=True)
+            criterion = context.residual_model.without.criterion
+            odds = scored[0].gain - _AGAINST_DEFECTS
+            return Explained(is_doubtful=True, criterion=criterion, odds=odds)
     return _explain(context, scored, advises=False)
 
 
@@ -153,7 +169,10 @@ def _explain(context: ResidualContext, scored: list[_Scored], *, advises: bool) 
         costly = list(_list_candidates(context, _COSTLY_PROPOSERS))
         scored += _score(context, costly, base.criterion)
         scored = _refit_finalists(context, _order(scored), base.criterion)
+    criterion, odds = base.criterion, 0.0
     is_doubtful = bool(scored) and STRONG_ODDS < scored[0].gain <= DEFECT_GAIN
+    if is_doubtful:
+        odds = scored[0].gain - _AGAINST_DEFECTS
     findings: list[Finding] = []
     while len(findings) < _MOST_FINDINGS:
         if not scored or scored[0].gain <= DEFECT_GAIN:
@@ -169,7 +188,9 @@ def _explain(context: ResidualContext, scored: list[_Scored], *, advises: bool) 
             found = _describe(context, best, before, rivals)
             is_tried = advises and not rivals
             findings.append(_try_setting(context, best.candidate, found) if is_tried else found)
+        odds -= _AGAINST_DEFECTS
         if best.moves is not None:
+            odds += best.gain
             break  # the estimate is another one then
         taken.append(best.candidate.columns)
         counted += best.candidate.counted
@@ -185,7 +206,9 @@ def _explain(context: ResidualContext, scored: list[_Scored], *, advises: bool) 
     if not findings:
         findings += find_disagreement_of_frequencies(context)
     is_cut_short = context.simulations.is_cut_short
-    return Explained(tuple(findings), not is_cut_short, is_doubtful or is_cut_short)
+    is_doubtful |= is_cut_short
+    odds += criterion - base.criterion
+    return Explained(tuple(findings), not is_cut_short, is_doubtful, criterion=criterion, odds=odds)
 
 
 def _propose_beside(beside: ResidualContext, others: Sequence[Candidate]) -> list[Candidate]:

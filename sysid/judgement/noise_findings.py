@@ -70,6 +70,30 @@ def find_noise_model(
         )
 
 
+def find_plant_noise(
+    problem: Problem, free_run: Mapping[str, float], gain: float
+) -> Iterator[Finding]:
+    """Find why a filter was chosen, with the estimates of the free run by squares.
+
+    `gain` is by how much the filter lowers Schwarz's criterion.
+    """
+    units = {parameter.name: parameter.unit for parameter in problem.free_parameters}
+    plain = ", ".join(
+        f"{name} = {value:.4g}{plain_unit(units[name])}"
+        for name, value in free_run.items()
+        if name in units
+    )
+    source = "noise inside the plant"
+    if problem.loss.noise_model == "drift":
+        source = f"drift of {join_names([one.name for one in problem.model.outputs])}"
+    yield note(
+        "noise in the plant",
+        "noise",
+        f"{source} explains the residuals better than coloured noise (BIC {gain:.3g} lower), so a "
+        f"filter follows it. Plain least squares (loss: {{noise_model: white}}) gives {plain}.",
+    )
+
+
 def find_unexplained(
     tests: ResidualTests, explained: Explained, analysis: Analysis
 ) -> Iterator[Finding]:

@@ -7,8 +7,8 @@ neighbours in the catalogue (`sysid.models.catalogue.process_family`).
 
 All orders are fitted to the same samples under the same assumptions, also the model's own: the
 entry of the catalogue, at rest if the model is, else with free initial states, and one integration
-step. Least squares starts from the estimate. A dead time that grows by the time constant that is
-left out keeps the sum of all.
+step. If a filter follows a load, it does so beside each order. Least squares starts from the
+estimate. A dead time that grows by the time constant that is left out keeps the sum of all.
 
 The criterion is Schwarz's (BIC, 1978), as for all explanations (`sysid.judgement.residual_model`):
 each order has noise of its own, an autoregression that is estimated with it. An order is preferred
@@ -29,7 +29,7 @@ import numpy as np
 from sysid.control.linear_form import IdentifiedModel
 from sysid.control.process_form import recognise_process
 from sysid.core.errors import SysidError
-from sysid.core.settings import FitSettings, Loss, StartKind
+from sysid.core.settings import FitSettings, FoundNoiseModel, Loss, StartKind
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
@@ -38,12 +38,14 @@ from sysid.judgement.levels import SEPARABLE, UNLIKELY_MOVE
 from sysid.judgement.residual_context import ResidualContext, find_delay_parameters
 from sysid.models.catalogue.load import load_model
 from sysid.models.catalogue.process_family import Process, ProcessEntry, list_neighbouring_orders
+from sysid.models.kalman_filter import is_noise_parameter
 from sysid.models.model import name_initial_state, replace_substeps
 from sysid.noise_models.first_order_fit import fit_first_order_noise
 from sysid.residuals.series import is_coloured, iterate_parts
 from sysid.results.findings import Finding, Move
 from sysid.results.parts import OrderComparison, OrderFit, compare_fits
 from sysid.search.refine import refine_candidates
+from sysid.simulation.free_run import convert_to_free_run
 from sysid.simulation.problem import Problem
 from sysid.simulation.start_values import starts_at_rest
 from sysid.uncertainty.analysis import analyse_estimate
@@ -69,12 +71,15 @@ class _Assumptions(NamedTuple):
         What no free parameter of the model changes.
     initial : {"rest", "free"}
         Where the states start.
+    sizes : tuple of float
+        Size and correlation time of a load beside the process; none without a filter.
     """
 
     process: Process
     delay: Estimate
     fixed: frozenset[str]
     initial: StartKind
+    sizes: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,9 +100,9 @@ def compare_orders(
     """Compare a model with those of one order more and one less; return the simulations too.
 
     None if the model is no process with one unknown dead time, or is not fitted by least squares
-    of a free run. Also if a gain, an offset or a start is at its bound, if it fits nearly without
-    residuals, or if the budget does not suffice. A dead time at its bound, in the model's own fit
-    or in that of the preferred order, says nothing of orders either.
+    of a free run or of a filter for a load. Also if a gain, an offset or a start is at its bound,
+    if it fits nearly without residuals, or if the budget does not suffice. A dead time at its
+    bound, in the model's own fit or in that of the preferred order, says nothing of orders either.
 
     Parameters
     ----------
@@ -118,10 +123,16 @@ def compare_orders(
     spent = sum(fitted.evaluations for fitted in fits)
     if len(fits) < max(2, len(tried)):
         return None, spent
-    has_colour = problem.loss.noise_model == "ar1" or _has_coloured_residuals(fits[-1])
+    noise_model = _get_filter(problem)
+    if noise_model == "white" and (
+        problem.loss.noise_model == "ar1" or _has_coloured_residuals(fits[-1])
+    ):
+        noise_model = "ar1"
     compared, contexts, bounded = list[OrderFit](), dict[str, ResidualContext](), set[str]()
     for fitted in fits:
-        order, context, is_bounded, simulations = _assess_order(fitted, has_colour=has_colour)
+        order, context, is_bounded, simulations = _assess_order(
+            fitted, has_colour=noise_model == "ar1"
+        )
         compared.append(order)
         contexts[order.model] = context
         bounded |= {order.model} if is_bounded else set()
@@ -135,7 +146,7 @@ def compare_orders(
         own,
         assumptions.delay.name,
         assumptions.delay.unit,
-        "ar1" if has_colour else "white",
+        noise_model,
         compared,
         problem.n_scored,
     )
@@ -242,8 +253,11 @@ def _write_delay(comparison: OrderComparison, fit: OrderFit) -> str:
 def _read_assumptions(
     problem: Problem, theta: FloatArray, estimates: Sequence[Estimate]
 ) -> _Assumptions | None:
-    if problem.prediction != "simulation" or problem.loss.kind != "squares":
+    if not _has_comparable_loss(problem):
         return None
+    pairs = zip(problem.free_names, theta.tolist(), strict=True)
+    sizes = tuple(value for name, value in pairs if is_noise_parameter(name))
+    problem, theta = convert_to_free_run(problem, theta)
     delays = find_delay_parameters(problem)
     process = _recognise(problem, theta)
     if process is None or len(delays) != 1 or not list_neighbouring_orders(process):
@@ -265,7 +279,20 @@ def _read_assumptions(
             part for part in ("gain", "offset") if getattr(other, part) != getattr(process, part)
         }
     initial: StartKind = "rest" if starts_at_rest(problem, theta) else "free"
-    return _Assumptions(process, delay, frozenset({"gain", "offset"} - changed), initial)
+    fixed = frozenset({"gain", "offset"} - changed)
+    return _Assumptions(process, delay, fixed, initial, sizes)
+
+
+def _has_comparable_loss(problem: Problem) -> bool:
+    """Whether it is squares of a free run, or of a filter that other orders have too."""
+    is_simulated = problem.prediction == "simulation" and problem.loss.kind == "squares"
+    return is_simulated and problem.loss.noise_model != "plant"
+
+
+def _get_filter(problem: Problem) -> FoundNoiseModel:
+    """Get the noise model that all orders share: that of a filter, or white noise."""
+    asked = problem.loss.noise_model
+    return asked if asked == "load" or asked == "drift" else "white"
 
 
 def _changes_dynamics(process: Process, other: Process) -> bool:
@@ -292,7 +319,7 @@ def _fit_order(
     except SysidError:
         return None
     starts = [
-        _to_theta(other, entry, process)
+        _to_theta(other, entry, process, assumptions.sizes)
         for process in _list_starts(assumptions.process, entry, problem)
     ]
     candidates = refine_candidates(other, starts, _MAX_SIMULATIONS // 2, is_late)
@@ -324,7 +351,7 @@ def _build_problem(problem: Problem, entry: ProcessEntry, assumptions: _Assumpti
             changes[name] = {"fixed": value, "lower": value - 1.0, "upper": value + 1.0}
     settings = FitSettings(
         changes,
-        loss=Loss(noise_model="white"),
+        loss=Loss(noise_model=_get_filter(problem)),
         weights={model.outputs[0].name: next(iter(problem.output_weights.values()))},
         skip=problem.settings.skip,
         initial=assumptions.initial,
@@ -356,9 +383,15 @@ def _list_starts(process: Process, entry: ProcessEntry, problem: Problem) -> lis
     ]
 
 
-def _to_theta(problem: Problem, entry: ProcessEntry, process: Process) -> FloatArray:
-    """Convert a process to the free parameters of an entry; all states start at the output."""
+def _to_theta(
+    problem: Problem, entry: ProcessEntry, process: Process, sizes: Sequence[float]
+) -> FloatArray:
+    """Convert a process to the free parameters of an entry; all states start at the output.
+
+    `sizes` are those of its noise, as the filter has them.
+    """
     values = dict(entry.to_parameters(process))
+    values |= zip(filter(is_noise_parameter, problem.free_names), sizes, strict=True)
     for number, record in enumerate(problem.records):
         measured = record.outputs[0].values
         first = float(measured[np.isfinite(measured)][0]) - process.offset

@@ -19,6 +19,7 @@ from sysid.judgement.lagged_products import OutputNoise
 from sysid.judgement.residual_model import ColumnFit, ResidualModel
 from sysid.judgement.start_slopes import compute_start_slopes, list_assumed_starts
 from sysid.kernels.signals.past_reads import is_difference, list_delayed_values
+from sysid.models.kalman_filter import is_noise_parameter
 from sysid.models.model import MAX_SUBSTEPS, replace_substeps
 from sysid.models.ties import collect_parameter_names
 from sysid.residuals.series import ResidualPart, iterate_parts
@@ -230,7 +231,7 @@ class ResidualContext:
         """
         assert self.analysis.residuals_and_sensitivities is not None
         error, columns = self.analysis.residuals_and_sensitivities
-        columns = np.where(self._is_held, 0.0, columns)
+        columns = np.where(self._is_held, 0.0, hold_noise(self.problem, columns))
         plain = ResidualModel(-error, columns, self.parts)
         if not self._integration_error.any():
             return plain
@@ -249,6 +250,7 @@ class ResidualContext:
         """Which parameters (D,) a bound holds."""
         assert self.analysis.residuals_and_sensitivities is not None
         error, columns = self.analysis.residuals_and_sensitivities
+        columns = hold_noise(self.problem, columns)
         return find_held(self.problem, self.theta, -error, columns)
 
     def take(self, columns: FloatArray) -> "ResidualContext":
@@ -280,8 +282,11 @@ class ResidualContext:
 
     @cached_property
     def parameter_numbers(self) -> list[tuple[int, str]]:
-        """Numbers and names of the free parameters that the model declares: no initial states."""
-        names = {parameter.name for parameter in self.problem.model.parameters}
+        """Numbers and names of the free parameters that the document declares.
+
+        So neither initial states nor the noise of a filter are among them.
+        """
+        names = {parameter.name for parameter in self.problem.given_model.parameters}
         return [(d, name) for d, name in enumerate(self.problem.free_names) if name in names]
 
     @cached_property
@@ -586,6 +591,17 @@ class ResidualContext:
                     rows[part.rows] = True
             if rows.any():
                 yield output.name, rows, format_unit(output.unit)
+
+
+def hold_noise(problem: Problem, columns: FloatArray) -> FloatArray:
+    """Hold the sizes of noise in sensitivities (n, D): their columns become 0.
+
+    A size scales the innovations. So its column is nearly the residuals themselves where it is at a
+    bound, and a linear step along it would explain anything. The information of Gaussian noise has
+    no term between its mean and its sizes, so holding them costs nothing.
+    """
+    is_size = np.array([is_noise_parameter(name) for name in problem.free_names], dtype=bool)
+    return np.where(is_size, 0.0, columns)
 
 
 def find_held(

@@ -44,7 +44,8 @@ from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.sensitivities import compute_sensitivities
 
-_MIN_GROWTH = 10.0  # of the effect of a start: a double integrator reaches three
+MIN_GROWTH = 10.0
+"""Of the effect of a start, from which on a run is unstable: a double integrator reaches three."""
 _MOST_SIMULATIONS = 3000  # of the fit to predictions: with fewer left, none is made
 
 
@@ -78,7 +79,7 @@ def compare_one_step(
         return None, 0
     most = _MOST_SIMULATIONS if max_simulations is None else max_simulations
     if most < _MOST_SIMULATIONS or not (
-        has_feedback or compute_growth(problem, theta) >= _MIN_GROWTH
+        has_feedback or compute_growth(problem, theta) >= MIN_GROWTH
     ):
         return None, 0
     ahead = _build_predictions(replace_holds(problem, doubtful) if doubtful else problem)
@@ -97,7 +98,7 @@ def compare_one_step(
     growth = compute_growth(problem, np.array([values[name] for name in problem.free_names]))
     predicted = analyse_estimate(ahead, best.theta)
     spent = len(starts) + end.evaluations + scan.evaluations + predicted.evaluations
-    if growth >= _MIN_GROWTH:
+    if growth >= MIN_GROWTH:
         cause = f"the free run is unstable: an error of its start grows {growth:.2g} times"
     elif _are_white(ahead, predicted):
         cause = "residuals of predictions are white: the noise acts inside the plant"

@@ -17,13 +17,12 @@ the same for a stationary process. The innovations y - ŷ are the residuals, and
 is minimised: the filter-error method (Maine and Iliff 1981) in innovations form.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
-from typing import Literal
 
 from sysid.core.errors import InvalidSettings
-from sysid.core.settings import NoiseModel
+from sysid.core.settings import FILTERED, NoiseModel, PlantNoise
 from sysid.core.units import divide_units, is_blank_unit
 from sysid.language.delays import collect_past_values
 from sysid.language.derivative import (
@@ -49,14 +48,12 @@ from sysid.models.model import (
     FixedInitial,
     Model,
     ModelSignal,
-    NoisePlaces,
     Output,
 )
 from sysid.models.parameters import Parameter
 from sysid.models.rest import NoRestError, solve_rest
 from sysid.models.sections import STEADY, get_interval
 
-PlantNoise = Literal["plant", "load"]
 _Pair = tuple[str, str]
 _Slopes = Mapping[_Pair, Expression]
 _Covariance = Mapping[frozenset[str], PastValue]
@@ -90,13 +87,36 @@ class NoiseScales:
     duration: float
 
 
-def find_plant_noise(model: Model, requested: NoiseModel) -> PlantNoise | None:
-    """Find the noise inside the plant that is asked for: by the setting, or by the document."""
-    if requested in ("plant", "load"):
-        return requested
-    if requested != "auto" or model.noise == NoisePlaces():
-        return None
-    return "plant" if model.noise.plant else "load"
+def check_noise_changes(names: Iterable[str], requested: NoiseModel) -> None:
+    """Check that parameters of a filter are changed only where one is asked for.
+
+    Raises
+    ------
+    InvalidSettings
+        If there is no filter yet: ``auto`` chooses one after the search, with sizes of its own.
+    """
+    for name in names:
+        if is_noise_parameter(name) and requested not in FILTERED:
+            kind = "plant" if name.startswith("noise[") else "load"
+            raise InvalidSettings(
+                f"/parameters/{name}",
+                f"{name} is a parameter of noise inside the plant. Set loss: "
+                f"{{noise_model: {kind}}} to change it",
+            )
+
+
+def list_plant_noise(model: Model) -> tuple[PlantNoise, ...]:
+    """List the noise that ``auto`` may choose: where the document names its places, and drift.
+
+    A load is nearly the drift of a sensor where the plant is fast, so one is not taken for the
+    other only if both are compared.
+    """
+    named: dict[PlantNoise, tuple[str, ...]] = {
+        "load": model.noise.load,
+        "plant": model.noise.plant,
+    }
+    found = tuple(noise for noise, names in named.items() if names)
+    return (*found, "drift") if found else ()
 
 
 def add_kalman_filter(model: Model, noise: PlantNoise, scales: NoiseScales) -> Model:
@@ -104,7 +124,8 @@ def add_kalman_filter(model: Model, noise: PlantNoise, scales: NoiseScales) -> M
 
     ``load`` adds loads: where the document names them, else at the first of those inputs that enter
     the same equations, whose loads nothing can tell apart. The parameters are ``load[u]``, its
-    deviation over the sensor's, and ``tau[u]``, its correlation time (s). ``plant`` lets states
+    deviation over the sensor's, and ``tau[u]``, its correlation time (s). ``drift`` adds them at
+    the outputs, as the drift of their sensors. ``plant`` lets states
     diffuse, with the parameter ``noise[x]``, per √s and over the sensor's deviation. These are
     the states that the document names, and its loads are added. Without them, they are all states
     that are not just the integral of another one.
@@ -119,8 +140,9 @@ def add_kalman_filter(model: Model, noise: PlantNoise, scales: NoiseScales) -> M
     diffusion: dict[str, Expression] = {}
     if noise == "plant":
         model, diffusion = _add_diffusion(model, scales)
-    if noise == "load" or model.noise.load:
-        model, loads = _add_loads(model, scales)
+    if noise != "plant" or model.noise.load:
+        signals = model.outputs if noise == "drift" else _list_loaded(model)
+        model, loads = _add_loads(model, signals, scales)
         diffusion |= loads
     if not diffusion:
         raise _refuse(noise, "no input enters an equation, so there is no place for a load")
@@ -134,10 +156,12 @@ def _refuse(noise: PlantNoise, reason: str) -> InvalidSettings:
     return InvalidSettings("/loss/noise_model", f"{noise} has no meaning here: {reason}")
 
 
-def _add_loads(model: Model, scales: NoiseScales) -> tuple[Model, dict[str, Expression]]:
+def _add_loads(
+    model: Model, signals: Sequence[ModelSignal | Output], scales: NoiseScales
+) -> tuple[Model, dict[str, Expression]]:
     """Add a state for each load; return the squared diffusion of the states that have one."""
     diffusion: dict[str, Expression] = {}
-    for signal in _list_loaded(model):
+    for signal in signals:
         load, deviation, time = f"d[{signal.name}]", f"load[{signal.name}]", f"tau[{signal.name}]"
         size, constant = Symbol(deviation, "parameter"), Symbol(time, "parameter")
         state = PastValue(load, "state")

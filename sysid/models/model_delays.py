@@ -14,6 +14,7 @@ from sysid.language.functions import Interval
 from sysid.language.printer import format_expression
 from sysid.language.tree import Expression, PastValue
 from sysid.language.value_intervals import bound_expression
+from sysid.models.kalman_filter import is_noise_parameter
 from sysid.models.model import DerivedInitial, Model, build_initial_parameters
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.sections import get_interval
@@ -267,8 +268,9 @@ def check_unused_settings(
     InvalidSettings, InvalidBounds
         With the pointer of the setting; also if the changes of parameters are invalid.
     """
+    own = {k: one for k, one in (changes or {}).items() if not is_noise_parameter(k)}  # no filter's
     overridden = override_parameters(
-        (*model.parameters, *build_initial_parameters(model, experiments)), dict(changes or {})
+        (*model.parameters, *build_initial_parameters(model, experiments)), own
     )
     tied = apply_ties(model, resolve_ties(model, overridden))
     for fault in find_unused_settings(tied, overridden[: len(model.parameters)], weights):

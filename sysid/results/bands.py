@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.core.errors import InvalidSettings
-from sysid.core.settings import FoundNoiseModel, Loss, PredictionKind
+from sysid.core.settings import FILTERED, FoundNoiseModel, Loss, PredictionKind
 from sysid.data.records import Channels, Record, Recording
 from sysid.models.model import Model, name_initial_state, replace_substeps
 from sysid.models.parse import keep_terms
@@ -147,7 +147,7 @@ def compute_fit_bands(
         records,
         parameters=changes,
         prediction=prediction,
-        loss=Loss(noise_model=noise_model if noise_model in ("plant", "load") else "white"),
+        loss=Loss(noise_model=noise_model if noise_model in FILTERED else "white"),
         weights=weights,
     )
     theta = np.array([values[name] for name in problem.free_names])

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from sysid.core.distributions import chi_square_limit
+from sysid.core.settings import FoundNoiseModel
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 
@@ -161,7 +162,7 @@ class OrderComparison:
         Unit of the dead times.
     delay_range : tuple of float
         Smallest and largest dead time of the open orders, in `unit`.
-    noise_model : {"white", "ar1"}
+    noise_model : {"white", "ar1", "load"}
         Noise model of the criteria.
     fits : tuple of OrderFit
         The orders, the lowest first.
@@ -172,7 +173,7 @@ class OrderComparison:
     delay: str
     unit: str
     delay_range: tuple[float, float]
-    noise_model: Literal["white", "ar1"]
+    noise_model: FoundNoiseModel
     fits: tuple[OrderFit, ...]
 
     @property
@@ -244,7 +245,7 @@ def compare_fits(
     model: str,
     delay: str,
     unit: str,
-    noise_model: Literal["white", "ar1"],
+    noise_model: FoundNoiseModel,
     fits: Sequence[OrderFit],
     samples: int,
 ) -> OrderComparison:

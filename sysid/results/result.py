@@ -137,7 +137,7 @@ class Result:
     noise_colour : NoiseColour or None
         Colour of the residuals that the errors assume. If they drift over the whole record, the
         errors are lower bounds.
-    noise_model : {"white", "ar1", "plant", "load"}
+    noise_model : {"white", "ar1", "plant", "load", "drift"}
         Noise model of the estimates.
     correlation_times : mapping of str to float
         Correlation time of each output's noise, s, where the noise model has one.

@@ -15,7 +15,7 @@ from sysid.data.records import Record
 from sysid.kernels.compilation.build import get_kernel_address
 from sysid.kernels.layout import KernelVariant
 from sysid.kernels.signals.past_reads import list_delaying_inputs
-from sysid.models.kalman_filter import add_kalman_filter, find_plant_noise
+from sysid.models.kalman_filter import add_kalman_filter, check_noise_changes
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.model_delays import check_delays
 from sysid.models.parameters import Parameter, override_parameters
@@ -172,9 +172,9 @@ class Problem:
                 f"found {len(scoring_starts)} times for {len(records)} records. Need one each",
             )
         given, model = model, replace_starts(model, settings.initial)
-        noise = find_plant_noise(model, settings.loss.noise_model)
-        if noise is not None:
-            settings = replace(settings, loss=replace(settings.loss, noise_model=noise))
+        noise = settings.loss.noise_model
+        check_noise_changes(settings.parameters, noise)
+        if noise == "plant" or noise == "load" or noise == "drift":
             model = add_kalman_filter(model, noise, measure_noise_scales(records))
         declared = (*model.parameters, *build_initial_parameters(model, len(records)))
         bounded = bound_by_data(add_units_of_data(declared, records), records)

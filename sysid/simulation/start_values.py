@@ -45,12 +45,15 @@ def _insert_inputs(tree: Expression, first_inputs: Mapping[str, float]) -> Expre
     return substitute(tree, find_input)
 
 
-def convert_point(before: Problem, after: Problem, theta: FloatArray) -> FloatArray:
+def convert_point(
+    before: Problem, after: Problem, theta: FloatArray, added: Mapping[str, float] | None = None
+) -> FloatArray:
     """Convert an estimate (D,) to a problem with other starts, and the same ones if it has them.
 
-    The bounds of the other problem hold.
+    `added` are values of parameters that only the other problem has. Its bounds hold.
     """
-    values = {**list_starts(before, theta), **dict(zip(before.free_names, theta, strict=True))}
+    own = dict(zip(before.free_names, theta.tolist(), strict=True))
+    values = {**(added or {}), **list_starts(before, theta), **own}
     point = np.array([values[name] for name in after.free_names])
     return np.asarray(np.clip(point, after.evaluator.lower, after.evaluator.upper))
 

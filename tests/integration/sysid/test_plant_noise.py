@@ -61,6 +61,53 @@ def test_a_load_is_told_and_the_plant_is_found() -> None:
     assert found.plant_noise.rms_free > 2.0 * found.rms
 
 
+def test_a_load_is_chosen_by_its_likelihood_and_white_noise_is_not() -> None:
+    record = make_record(0.1, 20.0)
+    asked = identify("fopdt", record, QUICK, loss=Loss(noise_model="load"))
+    found = identify("fopdt", record)
+    assert found.noise_model == "load"
+    for name in TRUTH:
+        assert found[name].value == pytest.approx(asked[name].value, rel=1e-3), name
+    (told,) = [one for one in found.findings if one.explanation == "noise in the plant"]
+    assert told.severity == "note"
+    assert "(loss: {noise_model: white}) gives K = " in told.text
+    assert found.order_comparison is not None
+    assert found.order_comparison.noise_model == "load"
+    warm = identify("fopdt", record, QUICK, warm={one.name: one.value for one in found.parameters})
+    assert warm["L"].value == pytest.approx(found["L"].value, rel=1e-3)
+    assert identify("fopdt", make_record(0.0, 20.0), QUICK).noise_model == "white"
+
+
+def test_the_size_of_noise_is_bounded_as_any_parameter() -> None:
+    loss, narrow = Loss(noise_model="load"), {"load[u]": (0.01, 1.0)}
+    found = identify("fopdt", make_record(0.1, 20.0), QUICK, loss=loss, parameters=narrow)
+    assert found["load[u]"].status == "at bound"
+
+
+def test_first_order_noise_of_a_sensor_is_no_load() -> None:
+    random, keep = np.random.default_rng(4), np.exp(-PERIOD / 3.0)
+    clean = make_record(0.0, 20.0)
+    noise = np.zeros(600)
+    for k in range(1, 600):
+        noise[k] = keep * noise[k - 1] + 0.02 * random.normal()
+    u, y = clean.inputs[0].values, clean.outputs[0].values - 20.0
+    assert identify("fopdt", build_record(u, y + noise), QUICK).noise_model == "ar1"
+
+
+def test_validation_is_predicted_by_the_filter_that_was_chosen() -> None:
+    found = identify("fopdt", make_record(0.1, 20.0), QUICK, validation_fraction=0.3)
+    asked = identify(
+        "fopdt",
+        make_record(0.1, 20.0),
+        QUICK,
+        loss=Loss(noise_model="load"),
+        validation_fraction=0.3,
+    )
+    assert found.noise_model == "load"
+    assert found.rms_validation == pytest.approx(asked.rms_validation, rel=1e-3)
+    assert found.rms_validation < 0.05
+
+
 def test_gaps_and_a_start_leave_the_likelihood_exact() -> None:
     record = make_record(0.1, 20.0)
     y = record.outputs[0].values.copy()
@@ -110,13 +157,15 @@ def test_an_unstable_plant_under_control_needs_no_free_run() -> None:
     times = PERIOD * np.arange(n)
     record = Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
     filtered = parse_model({**document, "noise": {"load": {"u": "estimate"}}})
-    found = identify(filtered, record, QUICK)
+    found = identify(filtered, record)
+    assert found.noise_model == "load"
     for name, true in {"K": 1.0, "T": 8.0, "L": 1.0}.items():
         low, high = found[name].interval95 or (np.nan, np.nan)
         assert low <= true <= high, name
     free = identify(parse_model(document), record)
     (told,) = [one for one in free.findings if one.explanation == "noise in the plant"]
     assert told.advice == "Use loss: {noise_model: load}."
+    assert free.noise_model == "white"
     moves = {move.parameter: move for move in told.moves}
     for name, move in moves.items():
         assert move.value == pytest.approx(found[name].value, abs=found[name].stderr)

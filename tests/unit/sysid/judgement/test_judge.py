@@ -168,7 +168,8 @@ def test_short_records_are_judged_or_left_alone(samples: int) -> None:
     u = draw_levels(1, samples)
     y = 2.0 * u + NOISE * draw_noise(1, n=samples)
     context = build_context([make_record(u, y)], parse_model(LINE), {"a": 2.0})
-    assert explain_residuals(context) == Explained((), is_done=samples > 14)
+    explained = explain_residuals(context)
+    assert (explained.findings, explained.is_done) == ((), samples > 14)
 
 
 def test_residuals_of_nothing_are_not_judged() -> None:

@@ -6,13 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sysid.core.settings import Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.judgement.judge import explain_residuals
 from sysid.judgement.residual_context import ResidualContext, find_delay_parameters, find_held
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.sensitivities import compute_sensitivities
 from tests.support.library.judged_records import (
     FAST,
@@ -331,3 +334,25 @@ def test_a_bound_holds_a_parameter_only_if_the_data_push_it_over(
     slopes = compute_sensitivities(problem, theta)
     held = find_held(problem, theta, -slopes.residuals, slopes.columns)
     assert held.tolist() == [is_held, False]
+
+
+def test_sizes_of_noise_explain_no_residuals() -> None:
+    u, random = draw_levels(3, N), np.random.default_rng(3)
+    drift = np.cumsum(0.02 * random.normal(size=N))
+    record = make_record(u, 2.0 * u + 1.0 + drift + NOISE * draw_noise(3))
+    settings = {"load[y]": {"lower": 0.01, "upper": 0.5}}  # too small: the size is at its bound
+    problem = Problem.build(
+        parse_model(LINE), [record], loss=Loss(noise_model="drift"), parameters=settings
+    )
+    start = dict(zip(problem.free_names, [2.0, 1.0, 0.5, 5.0], strict=True))
+    (end,) = refine_candidates(problem, [np.array([start[n] for n in problem.free_names])])
+    assert end is not None
+    context = ResidualContext(problem, end.theta, analyse_estimate(problem, end.theta))
+    lengths = np.linalg.norm(context.residual_model.columns, axis=0)
+    assert dict(zip(problem.free_names, lengths > 0.0, strict=True)) == {
+        "a": True,
+        "b": True,
+        "load[y]": False,
+        "tau[y]": False,
+    }
+    assert [name for _, name in context.parameter_numbers] == ["a", "b"]

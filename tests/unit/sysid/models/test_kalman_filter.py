@@ -11,6 +11,7 @@ from sysid.core.errors import InvalidModel, InvalidSettings
 from sysid.core.settings import Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
+from sysid.models.kalman_filter import list_plant_noise
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
 
@@ -183,7 +184,7 @@ def test_two_outputs_and_noise_in_two_states_have_their_exact_likelihood() -> No
 def test_the_drift_of_a_sensor_is_a_load_at_its_output() -> None:
     document = _write_lagged(noise={"load": {"y": "estimate"}})
     record = _record()
-    problem = Problem.build(parse_model(document), [record])
+    problem = Problem.build(parse_model(document), [record], loss=Loss(noise_model="load"))
     assert problem.free_names == ("K", "T", "L", "load[y]", "tau[y]")
     theta = np.array([[GAIN, CONSTANT, LAG, LOAD, CORRELATION]])
     free = Problem.build(parse_model(_write_lagged()), [record]).predict(theta[:, :3])[0]
@@ -208,13 +209,23 @@ def test_a_document_names_the_places_of_noise() -> None:
     model = parse_model(document)
     assert model.document["noise"] == document["noise"]
     assert parse_model(model.document) == model
-    both = Problem.build(model, [_record()])
+    both = Problem.build(model, [_record()], loss=Loss(noise_model="plant"))
     assert both.free_names == ("K", "T", "L", "noise[x]", "load[u]", "tau[u]")
     load = Problem.build(model, [_record()], loss=Loss(noise_model="load"))
     assert load.free_names == ("K", "T", "L", "load[u]", "tau[u]")
     white = Problem.build(model, [_record()], loss=Loss(noise_model="white"))
     assert white.free_names == ("K", "T", "L")
     assert (white.is_free_run, both.is_free_run) == (True, False)
+    assert list_plant_noise(model) == ("load", "plant", "drift")
+    assert list_plant_noise(parse_model(_write_lagged())) == ()
+
+
+def test_sizes_of_noise_are_changed_where_a_filter_is_asked_for() -> None:
+    model, changes = parse_model(_write_lagged()), {"tau[u]": {"fixed": 5.0}}
+    load = Problem.build(model, [_record()], parameters=changes, loss=Loss(noise_model="load"))
+    assert "tau[u]" not in load.free_names
+    with pytest.raises(InvalidSettings, match=r"Set loss: \{noise_model: load\}"):
+        Problem.build(model, [_record()], parameters=changes)
 
 
 @pytest.mark.parametrize(

@@ -258,7 +258,7 @@ def test_a_noise_model_gets_the_time_that_is_left_and_no_more(
 def test_what_a_noise_model_cannot_do_is_refused() -> None:
     with pytest.raises(InvalidSettings, match="need the loss 'squares'"):
         Loss("soft-l1", 0.1, "ar1")
-    with pytest.raises(InvalidSettings, match="auto, white, ar1, plant or load"):
+    with pytest.raises(InvalidSettings, match="auto, white, ar1, plant, load or drift"):
         Loss(noise_model="pink")  # type: ignore[arg-type]
     with pytest.raises(InvalidSettings, match="one-step predictions already contain the noise"):
         Problem.build(load_model(GAIN), [make_record(1)], loss=AR1, prediction="one-step")
