@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.core.text import join_names
+from sysid.core.types import RANK_TOLERANCE
 from sysid.core.units import format_unit
 from sysid.identifiability.combinations import IdentifiableCombination
-from sysid.judgement.levels import SEPARABLE
+from sysid.judgement.levels import NOTABLE_MOVE, SEPARABLE
 from sysid.models.parameters import BoundSide, Parameter
 from sysid.results.findings import Finding, Severity, note
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import Analysis
+from sysid.uncertainty.analysis import Analysis, compute_physical_scale
 from sysid.uncertainty.estimates import Estimate, Uncertainty
 
 _RIDGE_CORRELATION = 0.9  # of a time lag that is not separable from 0: it shares its effect
@@ -75,18 +76,39 @@ def _find_bounds(
     limits = "it is a physical limit" if len(names) == 1 else "they are physical limits"
     is_serious = bool(active) and not are_residuals_noise
     cause = " The residuals are not noise, which the bound may cause." if is_serious else ""
+    followers = [name for name in _find_followers(problem, analysis) if name not in names]
+    follow = "follow it" if len(followers) != 1 else "follows it"
     yield Finding(
         "bound",
         "identifiability",
         "serious" if is_serious else "caution",
         f"{join_names(names)} {lies}",
-        f"{join_names(texts)}. The best value may be outside, and other estimates follow it."
-        f"{cause}",
+        f"{join_names(texts)}. The best value may be outside, and "
+        f"{join_names(followers) if followers else 'other estimates'} {follow}.{cause}",
         f"{f'To widen: {cures}. Or' if cures else 'Widen the range, or'} set "
         f"{join_names(settings)} if {limits}.",
-        parameters=tuple(one.name for one in bounded) or tuple(names),
-        status="at bound",
+        parameters=(*([one.name for one in bounded] or names), *followers),
     )
+
+
+def _find_followers(problem: Problem, analysis: Analysis) -> list[str]:
+    """Find the parameters that move notably in the linear model without the bounds that hold some.
+
+    At a bound the others are the best *given* the bound. Their standard errors do not tell how far
+    they move without it (White, Econometrica 50 (1982) 1).
+    """
+    if analysis.residuals_and_sensitivities is None:
+        return []
+    known = {one.name: one for one in analysis.estimates}
+    theta = np.array([known[name].value for name in problem.free_names])
+    error, columns = analysis.residuals_and_sensitivities
+    step = np.linalg.lstsq(columns, -error, rcond=RANK_TOLERANCE)[0]
+    moved = np.abs(step * compute_physical_scale(problem, theta))
+    return [
+        name
+        for name, move in zip(problem.free_names, moved.tolist(), strict=True)
+        if (stderr := known[name].stderr) and move > NOTABLE_MOVE * stderr
+    ]
 
 
 def _find_limits(

@@ -10,11 +10,22 @@ from sysid.identifiability.active_bounds import ActiveBound
 from sysid.identifiability.combinations import IdentifiableCombination
 from sysid.judgement.determination import find_ambiguous, find_undetermined
 from sysid.models.catalogue.load import load_model
+from sysid.models.parse import parse_model
 from sysid.results.findings import Finding
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.estimates import Criteria, Estimate, EstimateStatus, Uncertainty
-from tests.support.library.judged_records import FAST, N, draw_record, make_record
+from tests.support.library.judged_records import (
+    FAST,
+    NOISE,
+    N,
+    build_context,
+    draw_levels,
+    draw_noise,
+    draw_record,
+    make_record,
+)
+from tests.support.library.small_models import LINE
 
 SOUND = Problem.build(load_model("fopdt"), [draw_record(FAST, 1)])
 
@@ -97,6 +108,27 @@ def test_a_bound_that_the_data_push_against_is_serious_beside_residuals_that_are
     assert (quiet.severity, found.severity) == ("caution", "serious")
     assert "raise the bound of L" in found.advice
     assert "which the bound may cause" in found.text
+
+
+@pytest.mark.parametrize(("level", "followers"), [(3.0, ("b",)), (0.0, ())])
+def test_what_moves_without_a_bound_that_is_pushed_follows_it(
+    level: float, followers: tuple[str, ...]
+) -> None:
+    """Offset and slope share their effect where the input has a mean, and only there."""
+    u = draw_levels(1)
+    u = u - float(np.mean(u)) + level
+    document = LINE | {"parameters": LINE["parameters"] | {"a": {"lower": -1.0, "upper": 2.0}}}
+    record = make_record(u, 2.1 * u + 1.0 + NOISE * draw_noise(1))
+    context = build_context([record], parse_model(document), {"a": 2.0, "b": 1.0})
+    (found,) = (
+        one
+        for one in find_undetermined(
+            context.problem, context.analysis, set(), are_residuals_noise=False
+        )
+        if one.explanation == "bound"
+    )
+    assert found.parameters == ("a", *followers)
+    assert ("b follows it" in found.text) == bool(followers)
 
 
 def test_a_bound_that_may_be_a_physical_limit_is_told_with_the_setting_that_says_so() -> None:
