@@ -11,6 +11,7 @@ import pytest
 from service.core.errors import ServiceBusy
 from service.core.process.concurrency import FairPlaces
 from tests.support.limits import LIMIT_SECONDS
+from tests.support.service.web_app import await_in_thread
 
 
 class Guests:
@@ -136,6 +137,6 @@ def test_a_request_that_waits_without_a_thread_leaves_its_place_too() -> None:
         await waiting
         await use()
 
-    asyncio.run(play())
+    await_in_thread(play)
     assert places._free == 1
     assert not places._waiting
