@@ -132,7 +132,7 @@ class Scheduler(Generic[Key]):
         """Stop jobs (all if not given): soft now, by force after the grace period."""
         for job in tuple(self._jobs if jobs is None else jobs):
             if job in self._jobs and job not in self._stopped:
-                self._stopped[job] = time.monotonic()
+                self._stopped[job] = read_awake_seconds()
                 self._jobs[job].stop_sending()
                 self._cancel_packs(job, force=False)
 
@@ -248,7 +248,7 @@ class Scheduler(Generic[Key]):
 
     def _stop_cancelled_jobs(self) -> None:
         self.stop_jobs([job for job, work in self._jobs.items() if work.observer.should_stop()])
-        now = time.monotonic()
+        now = read_awake_seconds()
         for job, since in self._stopped.items():
             if now - since > self._grace:
                 self._stopped[job] = float("inf")

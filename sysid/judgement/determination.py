@@ -99,7 +99,8 @@ def _find_bounds(
     limits = "it is a physical limit" if len(names) == 1 else "they are physical limits"
     is_serious = bool(active) and not are_residuals_noise
     cause = " The residuals are not noise, which the bound may cause." if is_serious else ""
-    followers = [name for name in _find_followers(problem, analysis) if name not in names]
+    at_bound = {*names, *(one.name for one in bounded)}
+    followers = [name for name in _find_followers(problem, analysis) if name not in at_bound]
     follow = "follow it" if len(followers) != 1 else "follows it"
     yield Finding(
         "bound",

@@ -76,7 +76,7 @@ def test_an_admin_makes_a_key_which_is_shown_once_and_revokes_it(
     token = visitor.locator("pre.key").inner_text().strip()
     assert token.startswith("lagid_")
     visitor.set_viewport_size({"width": 420, "height": 800})
-    assert visitor.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    visitor.wait_for_function("document.documentElement.scrollWidth <= innerWidth")
     visitor.get_by_text("Menu", exact=True).click()
     visitor.get_by_role("link", name="Keys").click()
     assert token not in visitor.content()

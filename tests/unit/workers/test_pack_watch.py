@@ -1,7 +1,5 @@
 """Packs that do not come back are given away once, and no worker that answers is suspected."""
 
-import time
-
 import pytest
 
 from tests.support.cluster.small_runs import ListedRuns, Notebook, spec
@@ -67,7 +65,6 @@ class HangingExecutor(ScriptedExecutor):
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Time:
     made = Time()
-    monkeypatch.setattr(time, "monotonic", made)
     monkeypatch.setattr(scheduler, "read_awake_seconds", made)
     return made
 

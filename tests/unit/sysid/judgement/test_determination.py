@@ -131,6 +131,23 @@ def test_what_moves_without_a_bound_that_is_pushed_follows_it(
     assert ("b follows it" in found.text) == bool(followers)
 
 
+def test_of_two_at_their_bounds_none_follows_the_other() -> None:
+    """Only one is listed by what the data push, and each is named once."""
+    u = draw_levels(1)
+    u = u - float(np.mean(u)) + 3.0
+    bounds = {"a": {"lower": -1.0, "upper": 2.0}, "b": {"lower": -1.0, "upper": 1.2}}
+    document = LINE | {"parameters": LINE["parameters"] | bounds}
+    record = make_record(u, 2.1 * u + 1.0 + NOISE * draw_noise(1))
+    context = build_context([record], parse_model(document), {"a": 2.0, "b": 1.2})
+    pushed = ActiveBound("a", "upper", 2.0, "1", 0.5)
+    analysis = replace(context.analysis, active_bounds=(pushed,))
+    assert [one.status for one in analysis.estimates] == ["at bound", "at bound"]
+    found = find_undetermined(context.problem, analysis, set(), are_residuals_noise=False)
+    (bound,) = (one for one in found if one.explanation == "bound")
+    assert sorted(bound.parameters) == ["a", "b"]
+    assert "b follows" not in bound.text
+
+
 def test_a_bound_that_may_be_a_physical_limit_is_told_with_the_setting_that_says_so() -> None:
     (low,) = find(K, make_estimate("L", "at bound", value=0.0))
     assert low.advice.endswith(
