@@ -689,11 +689,16 @@ class _EstimateSearch:
         return fits, spent
 
     def _is_doubtful(self, end: IslandEnd) -> bool:
-        """Whether the search may have missed the best minimum, a time lag's above all."""
+        """Whether the search may have missed the best minimum, a time lag's above all.
+
+        Innovations of a filter are white in any minimum, and show nothing.
+        """
         restarts = count_restarts(*self.state.champions_and_counters)
         share = _ENOUGH_SHARE * restarts.independent
         if restarts.confirmed > share:
             return False
+        if self.problem.model.corrections:
+            return True
         simulated = self.problem.predict(end.theta[None])[0]
         tests = run_residual_tests(self.problem, simulated, "estimation")
         return not is_explained(self.problem, end.rms, tests)

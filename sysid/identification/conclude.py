@@ -240,7 +240,10 @@ def _build_identification(
                 explanations,
             ),
             *find_unsettled(
-                evidence, estimates, lambda: find_cause_in_bounds(problem, theta, analysis)
+                evidence,
+                estimates,
+                lambda: find_cause_in_bounds(problem, theta, analysis),
+                is_filter=bool(problem.model.corrections),
             ),
             *find_contradictions(problem, metrics, validated, estimates),
             *find_misled_run(estimates, ahead),
