@@ -32,9 +32,8 @@ def find_unsettled(
         else f"{evidence.agreeing_starts} of {evidence.independent_starts} independent starts "
         "ended in the best minimum"
     )
-    residuals = (
-        "a filter leaves noise in any minimum" if is_filter else "the residuals are not noise"
-    )
+    white = "the residuals are not noise"
+    residuals = "a filter leaves noise in any minimum" if is_filter else white
     bounds = holding()
     cause = f" Bounds are the cause: {', '.join(map(str, bounds))}." if bounds else ""
     yield Finding(
