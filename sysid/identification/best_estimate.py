@@ -7,7 +7,7 @@ it (`integration_step`). At last residuals that are not white get a noise model
 (`generalised_least_squares`). The champions of the paper's two methods are analysed as they are.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from typing import NamedTuple
@@ -24,6 +24,7 @@ from sysid.identifiability.exchange import (
 from sysid.identification.budget import Budget
 from sysid.identification.deadline import Deadline
 from sysid.identification.plant_noise_choice import (
+    FilteredFit,
     ReplacedRun,
     fit_filters,
     fit_first_order_criterion,
@@ -44,6 +45,7 @@ from sysid.judgement.integration_step import (
 from sysid.judgement.judge import Explained, explain_if_noise, explain_residuals
 from sysid.judgement.levels import STRONG_ODDS
 from sysid.judgement.noise_findings import find_feedback
+from sysid.judgement.noise_sources import OpenSource, SourceComparison, name_source
 from sysid.judgement.residual_context import (
     ResidualContext,
     Simulations,
@@ -152,6 +154,8 @@ class BestEstimate:
         The search, with the parameters of `problem`.
     free_run : ReplacedRun or None
         The estimate by squares, if a filter was chosen instead.
+    sources : SourceComparison or None
+        Other sources of noise; None if they were not compared.
     """
 
     problem: Problem
@@ -164,6 +168,7 @@ class BestEstimate:
     starts: StartComparison | None
     state: RunState
     free_run: ReplacedRun | None
+    sources: SourceComparison | None
 
     @property
     def lowest_end(self) -> IslandEnd:
@@ -230,6 +235,7 @@ def find_best_estimate(
         search.starts,
         search.state,
         search.free_run,
+        search.sources,
     )
 
 
@@ -287,6 +293,7 @@ class _EstimateSearch:
         self._left: list[StartKind | None] = []
         self.starts: StartComparison | None = None
         self.free_run: ReplacedRun | None = None
+        self.sources: SourceComparison | None = None
         self._deadline, self._refines = deadline, refines
         is_asked = compares_starts or self._initial == "auto"
         self._compares_starts = refines and is_asked
@@ -403,12 +410,17 @@ class _EstimateSearch:
         ends = [one.theta for one in self.ends]
         known = (self.theta, *ends, *(one.theta for one in self._fits))
         most, late = self._budget.count_left(self._reserved), self._deadline.is_past_grace
-        found = fit_filters(problem, known, most, late)
-        if found is None:
+        filters = fit_filters(problem, known, most, late)
+        if not filters.fits:
             return False
+        found = filters.fits[0]
         first_order, spent = fit_first_order_criterion(problem, self.theta)
-        self._budget.spend(found.evaluations + spent)
+        self._budget.spend(filters.evaluations + spent)
         gain = min(explained.criterion, first_order) - found.criterion
+        values = dict(zip(problem.free_names, self.theta.tolist(), strict=True))
+        if gain <= max(explained.odds, 0.0) + STRONG_ODDS:
+            least = max(explained.odds, STRONG_ODDS) - STRONG_ODDS
+            self._compare_sources("", values, filters.fits[:1], found.criterion + gain, least)
         if gain <= STRONG_ODDS:
             return False
         feedback = tuple(
@@ -417,12 +429,46 @@ class _EstimateSearch:
         has_controller = bool(feedback) or compute_growth(problem, self.theta) >= MIN_GROWTH
         if gain <= STRONG_ODDS + max(explained.odds, 0.0) and not has_controller:
             return False
-        values = dict(zip(problem.free_names, self.theta.tolist(), strict=True))
+        self._compare_sources(
+            name_source(found.problem),
+            found.values,
+            filters.fits[1:],
+            found.criterion,
+            -STRONG_ODDS,
+        )
         self.free_run = ReplacedRun(values, gain, feedback)
         self.starts, self._left = None, []
         equal = found.problem.rebuild(deviations=None)
         self._continue_with(equal, found.theta, found.sizes)
         return True
+
+    def _compare_sources(
+        self,
+        name: str,
+        values: Mapping[str, float],
+        others: Sequence[FilteredFit],
+        criterion: float,
+        least: float,
+    ) -> None:
+        """Compare values with those of other sources of noise, if these gain more than the least.
+
+        `criterion` is that of the values, which assume the source with this name.
+        """
+        found = list[OpenSource]()
+        for other in others:
+            if criterion - other.criterion > least:
+                analysis = analyse_estimate(other.problem, other.theta)
+                self._budget.spend(analysis.evaluations)
+                found.append(
+                    OpenSource(
+                        name_source(other.problem),
+                        f"loss: {{noise_model: {other.problem.loss.noise_model}}}",
+                        criterion - other.criterion,
+                        other.values,
+                        {one.name: one.stderr for one in analysis.estimates if one.stderr},
+                    )
+                )
+        self.sources = SourceComparison(name, values, tuple(found))
 
     def _continue_with(
         self, problem: Problem, theta: FloatArray, added: Mapping[str, float] | None = None

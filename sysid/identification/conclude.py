@@ -49,6 +49,7 @@ from sysid.judgement.noise_findings import (
     find_plant_noise,
     find_unexplained,
 )
+from sysid.judgement.noise_sources import find_open_sources
 from sysid.judgement.open_terms import find_open_terms
 from sysid.judgement.preparation import (
     find_early_responses,
@@ -288,6 +289,7 @@ def _build_identification(
                 if replaced is None
                 else find_plant_noise(problem, replaced.values, replaced.gain)
             ),
+            *find_open_sources(best.sources, problem, estimates),
             *_list_notes(
                 "posterior", () if posterior is None else describe_posterior(posterior, estimates)
             ),

@@ -85,6 +85,18 @@ def test_a_load_is_chosen_by_its_likelihood_and_white_noise_is_not() -> None:
     assert identify("fopdt", make_record(0.0, 20.0), QUICK).noise_model == "white"
 
 
+def test_a_drift_of_the_sensor_is_nearly_a_load() -> None:
+    found = identify("fopdt", make_record(0.0, 20.0, walk=0.01, seed=8), QUICK)
+    assert found.noise_model == "drift"
+    (told,) = [one for one in found.findings if one.explanation == "source of noise"]
+    assert told.brief == "the data do not tell a drift of y from a slow load at u"
+    assert "(loss: {noise_model: load})" in told.text
+    assert all(abs(move.stderrs) < 1.0 for move in told.moves) == (told.severity == "note")
+    for name, true in TRUTH.items():
+        low, high = found[name].interval95 or (np.nan, np.nan)
+        assert low <= true <= high, name
+
+
 def test_the_size_of_noise_is_bounded_as_any_parameter() -> None:
     loss, narrow = Loss(noise_model="load"), {"load[u]": (0.01, 1.0)}
     found = identify("fopdt", make_record(0.1, 20.0), QUICK, loss=loss, parameters=narrow)
