@@ -45,7 +45,12 @@ from sysid.judgement.integration_step import (
 from sysid.judgement.judge import Explained, explain_if_noise, explain_residuals
 from sysid.judgement.levels import STRONG_ODDS
 from sysid.judgement.noise_findings import find_feedback
-from sysid.judgement.noise_sources import OpenSource, SourceComparison, name_source
+from sysid.judgement.noise_sources import (
+    OpenSource,
+    SourceComparison,
+    name_source,
+    open_defect,
+)
 from sysid.judgement.residual_context import (
     ResidualContext,
     Simulations,
@@ -417,58 +422,43 @@ class _EstimateSearch:
         first_order, spent = fit_first_order_criterion(problem, self.theta)
         self._budget.spend(filters.evaluations + spent)
         gain = min(explained.criterion, first_order) - found.criterion
-        values = dict(zip(problem.free_names, self.theta.tolist(), strict=True))
-        if gain <= max(explained.odds, 0.0) + STRONG_ODDS:
-            least = max(explained.odds, STRONG_ODDS) - STRONG_ODDS
-            self._compare_sources("", values, filters.fits[:1], found.criterion + gain, least)
-        if gain <= STRONG_ODDS:
-            return False
         feedback = tuple(
             find_feedback(problem, problem.predict(self.theta[None])[0], self.analysis)
         )
         has_controller = bool(feedback) or compute_growth(problem, self.theta) >= MIN_GROWTH
-        if gain <= explained.odds and not has_controller:
+        defects = max(explained.odds, 0.0)
+        values = dict(zip(problem.free_names, self.theta.tolist(), strict=True))
+        if gain <= STRONG_ODDS or (gain <= defects and not has_controller):
+            least = max(defects - STRONG_ODDS, 0.0)
+            own = found.criterion + gain
+            self.sources = SourceComparison("", values, self._list_open([found], own, least))
             return False
-        self._compare_sources(
-            name_source(found.problem),
-            found.values,
-            filters.fits[1:],
-            found.criterion,
-            -STRONG_ODDS,
-        )
+        others = self._list_open(filters.fits[1:], found.criterion, -STRONG_ODDS)
+        if gain - defects <= STRONG_ODDS and explained.findings and not has_controller:
+            others = (*others, open_defect(explained.findings[0], values, defects - gain))
+        self.sources = SourceComparison(name_source(found.problem), found.values, others)
         self.free_run = ReplacedRun(values, gain, feedback)
         self.starts, self._left = None, []
         equal = found.problem.rebuild(deviations=None)
         self._continue_with(equal, found.theta, found.sizes)
         return True
 
-    def _compare_sources(
-        self,
-        name: str,
-        values: Mapping[str, float],
-        others: Sequence[FilteredFit],
-        criterion: float,
-        least: float,
-    ) -> None:
-        """Compare values with those of other sources of noise, if these gain more than the least.
-
-        `criterion` is that of the values, which assume the source with this name.
-        """
+    def _list_open(
+        self, fits: Sequence[FilteredFit], criterion: float, least: float
+    ) -> tuple[OpenSource, ...]:
+        """List the sources of noise that lower a criterion by more than the least."""
         found = list[OpenSource]()
-        for other in others:
-            if criterion - other.criterion > least:
-                analysis = analyse_estimate(other.problem, other.theta)
+        for one in fits:
+            gain = criterion - one.criterion
+            if gain > least:
+                analysis = analyse_estimate(one.problem, one.theta)
                 self._budget.spend(analysis.evaluations)
+                setting = f"loss: {{noise_model: {one.problem.loss.noise_model}}}"
+                stderrs = {known.name: known.stderr for known in analysis.estimates if known.stderr}
                 found.append(
-                    OpenSource(
-                        name_source(other.problem),
-                        f"loss: {{noise_model: {other.problem.loss.noise_model}}}",
-                        criterion - other.criterion,
-                        other.values,
-                        {one.name: one.stderr for one in analysis.estimates if one.stderr},
-                    )
+                    OpenSource(name_source(one.problem), setting, gain, one.values, stderrs)
                 )
-        self.sources = SourceComparison(name, values, tuple(found))
+        return tuple(found)
 
     def _continue_with(
         self, problem: Problem, theta: FloatArray, added: Mapping[str, float] | None = None
@@ -737,11 +727,12 @@ class _EstimateSearch:
     def _is_doubtful(self, end: IslandEnd) -> bool:
         """Whether the search may have missed the best minimum, a time lag's above all.
 
-        Innovations of a filter are white in any minimum, and show nothing.
+        Innovations of a filter are white in any minimum, and show nothing. Nor does the search of
+        a free run that it took the place of.
         """
         restarts = count_restarts(*self.state.champions_and_counters)
         share = _ENOUGH_SHARE * restarts.independent
-        if restarts.confirmed > share:
+        if restarts.confirmed > share and self.free_run is None:
             return False
         if self.problem.model.corrections:
             return True

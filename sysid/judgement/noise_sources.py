@@ -71,6 +71,18 @@ def name_source(problem: Problem) -> str:
     return f"{'a slow load at' if kind == 'load' else 'noise in'} {join_names(places)}"
 
 
+def open_defect(finding: Finding, values: Mapping[str, float], gain: float) -> OpenSource:
+    """Make a source of a defect that a free run with these values shows."""
+    moves = finding.moves
+    return OpenSource(
+        f"a defect: {finding.brief}",
+        "loss: {noise_model: white}",
+        gain,
+        {**values, **{one.parameter: one.value for one in moves}},
+        {one.parameter: one.stderr for one in moves if one.stderr},
+    )
+
+
 def _is_size(name: str) -> bool:
     return is_noise_parameter(name) and not name.startswith("tau[")
 

@@ -11,8 +11,10 @@ from sysid.judgement.noise_sources import (
     SourceComparison,
     find_open_sources,
     name_source,
+    open_defect,
 )
 from sysid.models.catalogue.load import load_model
+from sysid.results.findings import Finding, Move
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
 from tests.support.library.search_problems import example
@@ -66,6 +68,17 @@ def test_beside_a_free_run_it_explains_as_much_as_what_was_found() -> None:
     assert told.brief == "a drift of y explains as much"
     assert "With that (loss: {noise_model: drift}), K is 2.30 ± 0.10." in told.text
     assert "Move q there and back" in told.advice
+
+
+def test_a_defect_is_a_source_too() -> None:
+    moves = (Move("K", 1.5, 0.1, -5.0),)
+    jump = Finding("step", "sensor", "caution", "y jumps at about 9 s", "", "", 30.0, moves, ("K",))
+    other = open_defect(jump, {"K": 2.0, "L": 4.0}, -3.0)
+    comparison = SourceComparison("a slow load at u", VALUES, (other,))
+    (told,) = find_open_sources(comparison, example(), (GAIN, LAG, SIZE))
+    assert told.parameters == ("K",)
+    assert told.brief == "the data do not tell a slow load at u from a defect: y jumps at about 9 s"
+    assert "With that (loss: {noise_model: white}), K is 1.50 ± 0.10." in told.text
 
 
 def test_nothing_was_compared() -> None:
