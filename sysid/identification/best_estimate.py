@@ -32,6 +32,7 @@ from sysid.identification.plant_noise_choice import (
 from sysid.identification.state_conversion import convert_state
 from sysid.islands.run_state import RunState
 from sysid.islands.stopping import count_restarts
+from sysid.judgement.input_hold import find_held_commands
 from sysid.judgement.integration_step import (
     HalfStep,
     can_halve_step,
@@ -212,10 +213,14 @@ def find_best_estimate(
         problem, state, budget, deadline, refines=refines, compares_starts=explains
     )
     steps = _settle_steps(search)
+    if search.hold_commands():
+        steps = _settle_steps(search)
     recorded = search.compare_where_recorded()  # a noise model would hide a contradiction
     explained = search.explain(explains=explains)
     if search.use_plant_noise(explained):
         steps = _settle_steps(search)
+        if search.hold_commands():
+            steps = _settle_steps(search)
         recorded = search.compare_where_recorded()
         explained = search.explain(explains=explains)
     first, half, limit = steps
@@ -401,6 +406,20 @@ class _EstimateSearch:
         """Continue with another start from the ends of all islands."""
         self._continue_with(best.problem, best.theta)
 
+    def hold_commands(self) -> bool:
+        """Read inputs held that a controller seems to compute, unless the request tells them."""
+        if self.problem.settings.commands is not None or not self._refines:
+            return False
+        left = self._budget.count_left(self._reserved)
+        simulations = Simulations(left, self._deadline.is_past_grace)
+        commands = find_held_commands(self.problem, self.theta, simulations)
+        self._budget.spend(simulations.spent)
+        if not commands:
+            return False
+        self.starts, self._left = None, []
+        self._continue_with(self.problem.rebuild(commands=commands, deviations=None), self.theta)
+        return True
+
     def use_plant_noise(self, explained: Explained) -> bool:
         """Take a filter if noise inside the plant is likelier than what explains the residuals.
 
@@ -425,7 +444,10 @@ class _EstimateSearch:
         feedback = tuple(
             find_feedback(problem, problem.predict(self.theta[None])[0], self.analysis)
         )
-        has_controller = bool(feedback) or compute_growth(problem, self.theta) >= MIN_GROWTH
+        commands = problem.settings.commands
+        has_controller = bool(feedback or commands) or (
+            commands is None and compute_growth(problem, self.theta) >= MIN_GROWTH
+        )
         defects = max(explained.odds, 0.0)
         values = dict(zip(problem.free_names, self.theta.tolist(), strict=True))
         if gain <= STRONG_ODDS or (gain <= defects and not has_controller):

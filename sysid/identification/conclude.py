@@ -45,6 +45,7 @@ from sysid.judgement.judge import select_explanations
 from sysid.judgement.levels import SOLVER_SHARE
 from sysid.judgement.noise_findings import (
     find_feedback,
+    find_loop,
     find_noise_model,
     find_plant_noise,
     find_unexplained,
@@ -186,7 +187,8 @@ def _build_identification(
         budget.spend(posterior.evaluations)
     feedback = list(find_feedback(problem, simulated, analysis))
     replaced = best.free_run
-    if replaced is not None and not tests.passed:  # a filter that does not fit explains no loop
+    # A filter that does not fit explains no loop.
+    if replaced is not None and not is_explained(problem, metrics.rms, tests):
         names = tuple(one.name for one in analysis.estimates if one.is_free)
         feedback = feedback or [replace(one, parameters=names) for one in replaced.feedback]
     left, late = budget.count_left(), deadline.is_past_grace
@@ -258,6 +260,7 @@ def _build_identification(
             ),
             *(() if is_of_the_solver else find_unexplained(tests, explained, analysis)),
             *feedback,
+            *find_loop(problem, asked),
             *find_unit_faults(problem),
             *find_useless_prediction(problem),
             *find_few_repeats(problem, analysis),
@@ -334,6 +337,7 @@ def _build_identification(
         onset_delays=estimate_onset_delays(problem.model, problem.records),
         data_bounds=tuple(p.name for p in problem.free_parameters if p.bounds is not None),
         input_hold=holds,
+        commands=problem.settings.commands or (),
         known_before=KnownBefore(
             _compute_input_history(problem),
             () if validation is None else _compute_input_history(validation),

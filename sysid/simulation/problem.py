@@ -15,6 +15,7 @@ from sysid.data.records import Record
 from sysid.kernels.compilation.build import get_kernel_address
 from sysid.kernels.layout import KernelVariant
 from sysid.kernels.signals.past_reads import list_delaying_inputs
+from sysid.models.channel_assignment import hold_commands
 from sysid.models.kalman_filter import add_kalman_filter, check_noise_changes
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.model_delays import check_delays
@@ -154,7 +155,7 @@ class Problem:
         InvalidSettings, InvalidBounds
             If a setting cannot be used.
         """
-        records = tuple(records)
+        records = hold_commands(model, records, settings.commands)
         if model.rule is not None:
             raise InvalidSettings(
                 "/model/terms",
