@@ -38,15 +38,13 @@ def find_loop(problem: Problem, asked: Problem) -> Iterator[Finding]:
     commands = problem.settings.commands
     if not commands or asked.settings.commands is not None:
         return
-    names, are = join_names(list(commands)), "are" if len(commands) > 1 else "is"
-    follow = "follow" if len(commands) > 1 else "follows"
-    yield note(
-        "closed loop",
-        "record",
-        f"{names} {follow} the residuals as the command of a controller does, so {names} {are} "
-        f"read held (commands: [{', '.join(commands)}]). If there is no controller, use "
-        "commands: [].",
-    )
+    for name in commands:
+        yield note(
+            "closed loop",
+            "record",
+            f"{name} follows the residuals as the command of a controller does, so it is read "
+            f"held. If there is no controller, use hold: {{{name}: first}}.",
+        )
 
 
 def find_noise_model(

@@ -49,7 +49,7 @@ def test_a_command_is_recognised_and_read_held() -> None:
         assert low <= true <= high, name
     (told,) = [one for one in found.findings if one.explanation == "closed loop"]
     assert told.severity == "note"
-    assert "(commands: [u])" in told.text
+    assert "hold={'u': 'first'}" in " ".join(found.warnings) or "hold: {u: first}" in told.text
     assert found.verdict.trust == "trustworthy"
 
 

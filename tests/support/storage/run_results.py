@@ -57,6 +57,7 @@ def conclude(
             onset_delays=(),
             data_bounds=(),
             input_hold=(),
+            commands=(),
             known_before=KnownBefore((), ()),
             search=SearchEvidence(True, "starts", 10, 5),
             posterior=None,
