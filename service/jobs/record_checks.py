@@ -171,8 +171,9 @@ def find_signal_faults(body: JobBody, model: Model) -> Iterator[FieldError]:
         if name in outputs and hold in MEANS:
             collect_faults(check_mean_output, faults, model, name, body["prediction"])
         yield from faults
-    collect_faults(check_commands, commands := [], model, body["commands"])
-    yield from commands
+    unknown: list[FieldError] = []
+    collect_faults(check_commands, unknown, model, body["commands"])
+    yield from unknown
     for name, weight in (body["weights"] or {}).items():
         numbers = weight if isinstance(weight, list) else [weight]
         if name not in outputs:

@@ -50,7 +50,11 @@ from sysid.judgement.noise_findings import (
     find_plant_noise,
     find_unexplained,
 )
-from sysid.judgement.noise_sources import find_open_sources
+from sysid.judgement.noise_sources import (
+    compute_response_gain,
+    find_no_response,
+    find_open_sources,
+)
 from sysid.judgement.open_terms import find_open_terms
 from sysid.judgement.preparation import (
     find_early_responses,
@@ -232,6 +236,7 @@ def _build_identification(
             ],
         )
     )
+    response = compute_response_gain(problem, theta, simulations)
     findings = order_findings(
         [
             *(find_exchanged_channels(problem, simulated, metrics) if compares_orders else ()),
@@ -292,6 +297,7 @@ def _build_identification(
                 if replaced is None
                 else find_plant_noise(problem, replaced.values, replaced.gain)
             ),
+            *find_no_response(problem, response, estimates),
             *find_open_sources(best.sources, problem, estimates),
             *_list_notes(
                 "posterior", () if posterior is None else describe_posterior(posterior, estimates)

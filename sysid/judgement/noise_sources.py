@@ -6,21 +6,34 @@ is nearly a jump of the sensor, or another gain. Each source is a filter, fitted
 whose odds are above 1 to 20 is open (Kass and Raftery 1995). It makes those parameters doubtful
 that it moves, and their intervals average over it (Hoeting et al. 1999).
 
+In a loop that only a load moves, the load may be all that the record shows. So the filter is
+fitted with constant inputs too. If the inputs have no strong odds against that, the gain may be 0,
+and then a lag has no meaning at all (Davies, Biometrika 64 (1977) 247).
+
 More samples tell sources apart: the logarithm of their odds grows with the length of the record. So
 do more moves of the input, which no source follows.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
+
 from sysid.core.text import join_names, plain_estimate, plain_unit
-from sysid.judgement.levels import NOTABLE_MOVE
+from sysid.core.types import RANK_TOLERANCE, FloatArray
+from sysid.data.records import Record
+from sysid.judgement.levels import NOTABLE_MOVE, STRONG_ODDS
+from sysid.judgement.residual_context import Simulations
 from sysid.models.kalman_filter import is_noise_parameter
 from sysid.results.findings import Finding, list_moves
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.sensitivities import compute_sensitivities
 
 _MOST_TOLD = 3  # moves in a sentence
+_STEPS = 30  # of least squares with constant inputs
 
 
 class OpenSource(NamedTuple):
@@ -85,6 +98,61 @@ def open_defect(finding: Finding, values: Mapping[str, float], gain: float) -> O
 
 def _is_size(name: str) -> bool:
     return is_noise_parameter(name) and not name.startswith("tau[")
+
+
+def compute_response_gain(
+    problem: Problem, theta: FloatArray, simulations: Simulations
+) -> float | None:
+    """Compute how much lower Schwarz's criterion is with the inputs than without, beside a filter.
+
+    None without a filter or inputs, or if simulations do not suffice.
+    """
+    if not problem.model.corrections or not problem.model.inputs:
+        return None
+    most = _STEPS * (theta.size + 1)
+    if not simulations.allow(most + 2 * theta.size):
+        return None
+    still = problem.replace_inputs([_make_still(record) for record in problem.records])
+    (end,) = refine_candidates(still, [theta], most, simulations.is_late)
+    if end is None:
+        return None
+    slopes = compute_sensitivities(still, end.theta)
+    simulations.spent += end.evaluations + slopes.evaluations
+    lost = theta.size - int(np.linalg.matrix_rank(slopes.columns, rtol=RANK_TOLERANCE))
+    (own,) = problem.evaluate_fitness(theta[None])
+    ratio = 2.0 * problem.n_scored * float(np.log(end.rms / own))
+    return ratio - lost * float(np.log(problem.n_scored))
+
+
+def _make_still(record: Record) -> Record:
+    return replace(
+        record,
+        inputs=tuple(
+            replace(one, values=np.full(one.values.size, one.values[0])) for one in record.inputs
+        ),
+    )
+
+
+def find_no_response(
+    problem: Problem, gain: float | None, estimates: Sequence[Estimate]
+) -> Iterator[Finding]:
+    """Find a record in which nothing shows that the inputs act on the outputs."""
+    if gain is None or gain > STRONG_ODDS:
+        return
+    inputs = join_names([signal.name for signal in problem.model.inputs])
+    outputs = join_names([output.name for output in problem.model.outputs])
+    brief = f"nothing shows that {inputs} moves {outputs}"
+    yield Finding(
+        "no response",
+        "noise",
+        "caution",
+        brief,
+        f"{brief}: the noise alone explains the record as well. So it does not tell the parameters "
+        "of the plant.",
+        f"Move {inputs}; in a loop move the set point, several times.",
+        parameters=tuple(one.name for one in estimates if one.is_free),
+        reason=brief,
+    )
 
 
 def find_open_sources(

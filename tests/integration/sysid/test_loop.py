@@ -8,7 +8,11 @@ from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
+from sysid.judgement.levels import STRONG_ODDS
+from sysid.judgement.noise_sources import compute_response_gain
+from sysid.judgement.residual_context import Simulations
 from sysid.models.catalogue.load import load_model
+from sysid.results.identification import Identification
 from sysid.simulation.problem import Problem
 
 PERIOD, LAG = 0.25, 4.25
@@ -16,16 +20,16 @@ TRUTH = {"K": 2.0, "T": 12.3, "L": LAG}
 SMALL = GeneticAlgorithm(population=24, generations=20)
 
 
-def make_loop(load: float = 0.1, seed: int = 1, samples: int = 1200) -> Record:
+def make_loop(load: float = 0.1, seed: int = 1, samples: int = 1200, wish: float = 1.0) -> Record:
     """First order with a dead time, a load at its input, and a PI controller with set points."""
     random = np.random.default_rng(seed)
-    wish = np.repeat([0.0, 1.0, -1.0, 1.0, -1.0, 1.0, 0.0, 1.0], 150)[:samples]
+    wishes = wish * np.repeat([0.0, 1.0, -1.0, 1.0, -1.0, 1.0, 0.0, 1.0], 150)[:samples]
     keep, decay = np.exp(-PERIOD / TRUTH["T"]), np.exp(-PERIOD / 50.0)
     x, d, total = 0.0, load * random.normal(), 0.0
     u, y = np.empty(samples), np.empty(samples)
     for k in range(samples):
         y[k] = x + 0.02 * random.normal()
-        error = wish[k] - y[k]
+        error = wishes[k] - y[k]
         total += 0.35 * PERIOD / 12.3 * error
         u[k] = 0.35 * error + total
         x = keep * x + 2.0 * (1 - keep) * (u[max(k - round(LAG / PERIOD), 0)] + d)
@@ -63,6 +67,25 @@ def test_a_loop_may_be_declared_or_denied() -> None:
     assert denied.commands == ()
     assert denied.input_hold[0].chosen == "first"
     assert not [one for one in denied.findings if one.explanation in ("closed loop", "feedback")]
+
+
+def test_a_loop_that_only_a_load_moves_tells_nothing_of_the_plant() -> None:
+    still = make_loop(load=0.3, wish=0.0)
+    found = identify("fopdt", still, commands=["u"], loss=Loss(noise_model="load"))
+    gain = compute_gain(found, still)
+    assert gain < STRONG_ODDS
+    assert all(found[name].status != "identified" for name in TRUTH)
+    assert compute_gain(identify("fopdt", make_loop()), make_loop()) > 50.0
+
+
+def compute_gain(found: Identification, record: Record) -> float:
+    loss = Loss(noise_model="load")
+    problem = Problem.build(load_model("fopdt"), [record], loss=loss, initial="rest")
+    problem = problem.rebuild(commands=("u",))
+    theta = np.array([found[name].value for name in problem.free_names])
+    gain = compute_response_gain(problem, theta, Simulations())
+    assert gain is not None
+    return gain
 
 
 def test_a_given_hold_wins_over_a_command() -> None:

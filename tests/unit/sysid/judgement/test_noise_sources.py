@@ -9,6 +9,7 @@ from sysid.judgement.conclusions import conclude_estimates, conclude_verdict
 from sysid.judgement.noise_sources import (
     OpenSource,
     SourceComparison,
+    find_no_response,
     find_open_sources,
     name_source,
     open_defect,
@@ -79,6 +80,17 @@ def test_a_defect_is_a_source_too() -> None:
     assert told.parameters == ("K",)
     assert told.brief == "the data do not tell a slow load at u from a defect: y jumps at about 9 s"
     assert "With that (loss: {noise_model: white}), K is 1.50 ± 0.10." in told.text
+
+
+@pytest.mark.parametrize(("gain", "is_told"), [(None, False), (50.0, False), (2.0, True)])
+def test_a_plant_that_shows_no_response_has_no_estimate(gain: float | None, is_told: bool) -> None:
+    told = list(find_no_response(build("load"), gain, (GAIN, LAG, SIZE)))
+    assert bool(told) == is_told
+    if told:
+        assert told[0].brief == "nothing shows that u moves y"
+        concluded = conclude_estimates((GAIN, LAG), told)
+        assert {one.status for one in concluded} == {"dependent"}
+        assert conclude_verdict(concluded, told, ["K", "L"]).trust == "not trustworthy"
 
 
 def test_nothing_was_compared() -> None:
