@@ -491,6 +491,42 @@ class DeletedDocument(TypedDict):
     deleted: list[ItemDocument]
     """all items, the requested one first"""
 
+class DisturbanceExperimentDocument(TypedDict):
+    """Disturbances of one record."""
+
+    name: str
+    """name of the record"""
+    disturbances: list[DisturbanceDocument]
+    """disturbance at each place"""
+
+class DisturbanceDocument(TypedDict):
+    """An estimated disturbance with its 95 % band, in `unit`; null where the filter diverged."""
+
+    place: str
+    """input or output with a load, or state that noise moves"""
+    kind: Literal["load", "plant"]
+    """a load, or a state of the plant itself"""
+    unit: str
+    """unit of all values"""
+    samples: int
+    """times before the reduction"""
+    times: list[float]
+    """times, s"""
+    values: list[float | None]
+    """estimate from the whole record"""
+    lower: list[float | None]
+    """lower end of the band"""
+    upper: list[float | None]
+    """upper end of the band"""
+
+class DisturbancesDocument(TypedDict):
+    """Estimated disturbances of a run with noise inside the plant; without it there are no records."""
+
+    id: str
+    """identifier of the run"""
+    experiments: list[DisturbanceExperimentDocument]
+    """records of the run"""
+
 class DriftDocument(TypedDict):
     """Difference between an estimate and a reference."""
 
