@@ -1361,7 +1361,7 @@ class ParameterSummaryDocument(TypedDict):
     """least standard deviation under the added noise"""
 
 class PlantNoiseDocument(TypedDict):
-    """Noise inside the plant, and the free run beside the predictions that the result shows."""
+    """Noise inside the plant, and errors from one sample ahead to the free run."""
 
     sources: list[NoiseSourceDocument]
     """the sensors, then the noise inside the plant"""
@@ -1369,6 +1369,8 @@ class PlantNoiseDocument(TypedDict):
     """RMS error of the free run with the same estimates, in the unit of the result's `rms`; none if it diverges"""
     fit_free: float | None
     """its fit, %"""
+    prediction_errors: list[PredictionErrorDocument]
+    """RMS errors of predictions 1, 2, 5, 10, … samples ahead, up to a tenth of the shortest record"""
 
 class PointDocument(TypedDict):
     """Estimate of one quantity at one label."""
@@ -1431,6 +1433,16 @@ class PosteriorParameterDocument(TypedDict):
     """the 2.5 and 97.5 % quantiles, in `unit`"""
     effective_samples: float | None
     """number of independent samples that would estimate the mean as well"""
+
+class PredictionErrorDocument(TypedDict):
+    """Error of predictions so many samples ahead."""
+
+    samples: int
+    """samples ahead"""
+    time: float | None
+    """mean time ahead, s"""
+    rms: float | None
+    """RMS error, in the unit of the result's `rms`; none if a prediction diverged"""
 
 class ProfileDocument(TypedDict):
     """Profile likelihood of one parameter."""

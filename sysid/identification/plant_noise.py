@@ -12,6 +12,7 @@ from sysid.results.parts import NoiseSource, PlantNoise
 from sysid.simulation.data_bounds import list_units
 from sysid.simulation.free_run import simulate_free_run
 from sysid.simulation.problem import Problem, compute_metrics
+from sysid.simulation.steps_ahead import measure_prediction_errors
 
 
 def describe_plant_noise(problem: Problem, theta: FloatArray, rms: float) -> PlantNoise | None:
@@ -33,6 +34,7 @@ def describe_plant_noise(problem: Problem, theta: FloatArray, rms: float) -> Pla
         tuple(_list_sources(problem, values, sensor)),
         metrics.rms if is_finite else None,
         metrics.fit_percent if is_finite else None,
+        measure_prediction_errors(problem, theta),
     )
 
 

@@ -90,6 +90,20 @@ def test_page_figure_and_report_show_it(served_run: ServedRun) -> None:
     read_faults(server.get(f"/v1/runs/{run}/figures/disturbances?experiment=1"), 404, "not-found")
 
 
+def test_errors_of_predictions_lie_between_one_sample_and_the_free_run(
+    served_run: ServedRun,
+) -> None:
+    server, run = served_run.server, served_run.run
+    noise = server.get(f"/v1/runs/{run}").json()["plant_noise"]
+    errors = noise["prediction_errors"]
+    assert [one["samples"] for one in errors] == [1, 2, 5, 10, 20]
+    assert [one["time"] for one in errors] == pytest.approx([0.25, 0.5, 1.25, 2.5, 5.0])
+    assert errors[0]["rms"] < errors[-1]["rms"] < noise["rms_free"]
+    page = server.get(f"/runs/{run}").text
+    assert '<tr><th scope="row">20 samples ahead</th>' in page
+    assert '<tr><th scope="row">free run</th>' in page
+
+
 def test_a_run_without_a_load_has_none(
     served_run: ServedRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
