@@ -14,7 +14,7 @@ from sysid.data.records import Channels, Record, Recording
 from sysid.models.model import Model, name_initial_state, replace_substeps
 from sysid.models.parse import keep_terms
 from sysid.models.starts import replace_starts
-from sysid.results.parts import PlantNoise
+from sysid.results.parts import find_sensor_weights
 from sysid.results.result import FittedData, FullResult, Result
 from sysid.simulation.fit_metrics import ChannelMetrics
 from sysid.simulation.problem import Problem
@@ -158,25 +158,11 @@ def build_fit(
         settings = replace(
             settings,
             loss=Loss(noise_model=filtered.noise_model),
-            weights=weights | _find_weights(filtered.plant_noise, values),
+            weights=weights | find_sensor_weights(filtered.plant_noise, values),
             deviations=filtered.noise_deviations,
         )
     problem = Problem.from_settings(model, records, settings)
     return problem, np.array([values[name] for name in problem.free_names])
-
-
-def _find_weights(noise: PlantNoise, values: Mapping[str, float]) -> dict[str, float]:
-    """Find the weights of outputs that a filter had: a sensor's share of the sizes' common unit."""
-    shares = [
-        one.deviation / values[f"{'load' if one.kind == 'load' else 'noise'}[{one.place}]"]
-        for one in noise.sources
-        if one.kind != "sensor"
-    ]
-    return {
-        one.place: shares[0] / one.deviation
-        for one in noise.sources
-        if one.kind == "sensor" and one.deviation > 0.0
-    }
 
 
 def estimate_noise(agreement: Iterable[ChannelMetrics], degrees: float) -> NoiseDeviations:

@@ -237,6 +237,23 @@ class PlantNoise:
     prediction_errors: tuple[PredictionError, ...] = ()
 
 
+def find_sensor_weights(noise: PlantNoise, values: Mapping[str, float]) -> dict[str, float]:
+    """Find the weight w of each output in a filter: 1/w is its sensor's relative deviation.
+
+    Sizes of noise among the `values` of the parameters are relative to the same deviation.
+    """
+    relative_to = [
+        one.deviation / values[f"{'load' if one.kind == 'load' else 'noise'}[{one.place}]"]
+        for one in noise.sources
+        if one.kind != "sensor"
+    ]
+    return {
+        one.place: relative_to[0] / one.deviation if one.deviation > 0.0 else 1.0
+        for one in noise.sources
+        if one.kind == "sensor"
+    }
+
+
 def _is_open(fit: OrderFit, best: OrderFit, samples: int) -> bool:
     """Whether the data do not rule out an order, and speak for the parameters that it has more."""
     more = len(fit.values) - len(best.values)

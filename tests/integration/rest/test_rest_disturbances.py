@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from service.runs import disturbances
+from tests.support.library.exported_programs import observe_python
 from tests.support.service.local_runs import ServedRun, identify_job, serve_run
 from tests.support.service.web_app import parts_of, read_faults, store_csv
 
@@ -102,6 +103,20 @@ def test_errors_of_predictions_lie_between_one_sample_and_the_free_run(
     page = server.get(f"/runs/{run}").text
     assert '<tr><th scope="row">20 samples ahead</th>' in page
     assert '<tr><th scope="row">free run</th>' in page
+
+
+def test_the_exported_observer_predicts_what_the_run_does(served_run: ServedRun) -> None:
+    server, run = served_run.server, served_run.run
+    text = server.get(f"/v1/runs/{run}/export", params={"format": "python"}).text
+    table = np.genfromtxt(write_recording().decode().splitlines(), delimiter=",", skip_header=1)
+    (predicted,) = observe_python(text, [table[:, 1]], [table[:, 2]])
+    response = server.get(f"/v1/runs/{run}/response").json()["experiments"]
+    shown = [value for part in response for value in part["simulated"][0]["values"]]
+    # Validation data begin anew, from what was estimated for them.
+    np.testing.assert_allclose(predicted[:480], shown[:480], rtol=1e-9, atol=1e-9)
+    values = server.get(f"/v1/runs/{run}/export").json()["values"]
+    assert [one["name"] for one in values][:4] == ["K", "T", "L", "y0"]
+    assert not any("[" in one["name"] for one in values)
 
 
 def test_a_run_without_a_load_has_none(
