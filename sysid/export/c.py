@@ -28,7 +28,7 @@ from sysid.export.program import (
 )
 from sysid.language.functions import FUNCTIONS, Level
 from sysid.language.time_switches import HALVINGS
-from sysid.models.model import MeasuredInitial
+from sysid.models.model import MeasuredInitial, ModelSignal, Output
 from sysid.simulation.grid import GRID_TOLERANCE
 
 _RESERVED_WORDS = (
@@ -559,9 +559,10 @@ def _write_observer_comment(program: GeneratedProgram, observer: Observer) -> st
         "it predicts further ahead; a copy of the struct keeps the present.",
         f"Time lags may be up to {observer.longest_lag:.6g} s.",
     ]
-    for signal in (*identified.model.inputs, *identified.model.outputs):
+    signals: tuple[ModelSignal | Output, ...] = identified.model.inputs
+    names = {**program.input_names, **program.output_names}
+    for signal in (*signals, *identified.model.outputs):
         unit = describe_unit(identified.get_unit(signal))
-        names = {**program.input_names, **program.output_names}
         lines.append(f"{names[signal.name]}: {signal.name}, {unit}.")
     return "/*\n" + "\n".join(f" * {escape_c_comment(line)}" for line in lines) + "\n */"
 

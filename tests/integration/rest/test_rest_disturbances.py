@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.core.computed import ComputedValues
 from service.runs import disturbances
 from tests.support.library.exported_programs import observe_python
 from tests.support.service.local_runs import ServedRun, identify_job, serve_run
@@ -128,7 +129,7 @@ def test_a_run_without_a_load_has_none(
     assert 'data-figure="disturbances"' not in server.get(f"/runs/{white}").text
     read_faults(server.get("/v1/runs/run_none/disturbances"), 404, "not-found")
     monkeypatch.setattr(disturbances, "MAX_VALUES", 10)
-    monkeypatch.setattr(disturbances, "_computed_disturbances", disturbances.ComputedValues(1))
+    monkeypatch.setattr(disturbances, "_computed_disturbances", ComputedValues(1))
     answer = server.get(f"/v1/runs/{served_run.run}/disturbances")
     read_faults(answer, 409, "conflict")
     assert "need at most 10. Use `compute_disturbances`" in answer.text

@@ -195,9 +195,9 @@ def test_a_result_is_saved_exported_simulated_and_drawn(tmp_path: Path) -> None:
     assert "load at u" in str(found.plot().layout)
     with pytest.raises(InvalidSettings, match="disturbances of 1 records"):
         found.compute_disturbances(experiment=1)
-    free = identify("fopdt", make_record(0.0, 20.0), QUICK, loss=Loss(noise_model="white"))
+    white = identify("fopdt", make_record(0.0, 20.0), QUICK, loss=Loss(noise_model="white"))
     with pytest.raises(InvalidSettings, match="no noise acts inside the plant"):
-        free.plot("disturbances")
+        white.plot("disturbances")
 
 
 def test_bands_and_disturbances_of_several_outputs_are_those_of_the_fit() -> None:
