@@ -233,6 +233,8 @@ def _read_noise(
         detail = "belongs to the differential form; a recursion predicts from measured values"
         reader.add_fault("/noise", detail)
         return NoisePlaces()
+    if len(trees) < len(scope.states):  # the faults of the equations are told first
+        return NoisePlaces()
     equations_of = dict(zip(scope.states, trees, strict=True))
     return read_noise(reader, value, equations_of, scope.inputs, outputs)
 
