@@ -2,23 +2,19 @@
 
 A step takes some 160 bytes and up to a microsecond. So the longest simulation takes 3 GB and half a
 minute, most of it with the interpreter's lock held: no other request would be answered meanwhile.
-A child takes one of the places of those that read uploads, and its share of the memory.
 """
 
-import json
-import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
-from service.core.errors import FieldError, InvalidRequest, Unavailable
+from service.core.errors import FieldError, InvalidRequest
 from service.core.process import temporary_files
 from service.core.process.concurrency import ReaderPlaces
+from service.datasets.data_child import ask_child
 from service.formats.mcap.mcap_files import read_mcap, write_recording
-from sysid.core.child_processes import CODE_CACHE_VARIABLES, OUT_OF_PROCESSOR_TIME, run_child
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
 from sysid.kernels.compilation.compile_task import encode_model
@@ -26,10 +22,6 @@ from sysid.models.model import Model
 
 LARGE_STEPS = 2_000_000
 """Integration steps of a longer simulation, which a child does: some 320 MB."""
-SECONDS = 120.0
-"""Processor time of a child; the longest simulation takes some 40 s."""
-_WALL_SECONDS = 2 * SECONDS  # on a busy machine
-_MIB = 1024**2
 _TIMES = "t"
 
 
@@ -119,22 +111,13 @@ def _simulate_in_child(
         "values": dict(values),
         "source": str(source),
         "target": str(target),
-        "seconds": SECONDS,
-        "memory_bytes": memory_bytes,
     }
-    what = f"a simulation of {count_steps(model, times):.3g} steps"
-    try:
-        child = run_child(
-            "service.datasets.simulation_child",
-            json.dumps(task).encode(),
-            seconds=_WALL_SECONDS,
-            variables=CODE_CACHE_VARIABLES,
-        )
-    except subprocess.TimeoutExpired:
-        raise _build_refusal(what, f"{_WALL_SECONDS:g} s") from None
-    if child.returncode == OUT_OF_PROCESSOR_TIME:
-        raise _build_refusal(what, f"{SECONDS:g} s of processor time")
-    _check_answer(child, what, memory_bytes)
+
+    def refuse(limit: str) -> FieldError:
+        steps = f"a simulation of {count_steps(model, times):.3g} steps"
+        return FieldError("/samples", f"{steps} needs more than {limit}; ask for fewer samples")
+
+    ask_child("service.datasets.simulation_child", task, memory_bytes, refuse)
     return read_mcap(target)
 
 
@@ -144,32 +127,3 @@ def name_times(inputs: Sequence[Channel]) -> str:
     while any(channel.name == name for channel in inputs):
         name += _TIMES
     return name
-
-
-def _check_answer(
-    child: "subprocess.CompletedProcess[bytes]", what: str, memory_bytes: int
-) -> None:
-    try:
-        answer: dict[str, Any] = json.loads(child.stdout)
-    except json.JSONDecodeError:
-        errors = child.stderr.decode(errors="replace")
-        # Ended by the system, or by a library that got no memory.
-        if child.returncode < 0 or "MemoryError" in errors or "allocate" in errors:
-            answer = {"is_out_of_memory": True}
-        else:
-            raise RuntimeError(
-                f"the simulation ended with code {child.returncode}: {errors[-500:]}"
-            ) from None
-    if answer.get("is_out_of_memory"):
-        limit = f"{memory_bytes // _MIB} MiB of memory (LAGID_READER_MEMORY_MB)"
-        raise _build_refusal(what, limit)
-    if answer.get("is_disk_full"):
-        raise Unavailable(temporary_files.FULL_DISK_MESSAGE)
-    if answer["errors"]:
-        raise InvalidRequest(FieldError(**fault) for fault in answer["errors"])
-
-
-def _build_refusal(what: str, limit: str) -> InvalidRequest:
-    return InvalidRequest.from_fault(
-        "/samples", f"{what} needs more than {limit}; ask for fewer samples"
-    )

@@ -132,7 +132,7 @@ def derive_dataset(
     dataset_id: str, body: DeriveIn, parts: PartsDep, response: Response
 ) -> DatasetOut:
     """Derive a dataset from another, by its id or name: add noise, resample, trim, select etc."""
-    stored = datasets.derive_dataset(parts.database, parts.store, dataset_id, body)
+    stored = datasets.derive_dataset(parts.database, parts.store, parts.readers, dataset_id, body)
     return _dataset_response(stored, response, body.name)
 
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from service.cli import common, run_commands
 from service.client.client import Client
-from service.datasets import large_simulation
+from service.datasets import data_child, large_simulation
 from service.formats.mcap.mcap_files import read_mcap
 from sysid.core.child_processes import run_child
 from tests.support.library.catalogue_cases import ACTUATOR
@@ -384,7 +384,7 @@ def test_long_simulations_are_done_by_a_child_with_the_same_bits(
         children.append(args[0])
         return run_child(*args, **options)
 
-    monkeypatch.setattr(large_simulation, "run_child", count)
+    monkeypatch.setattr(data_child, "run_child", count)
     monkeypatch.setattr(large_simulation, "LARGE_STEPS", 1)
     assert [
         simulate_run(plants, plants.arm, LOOP),

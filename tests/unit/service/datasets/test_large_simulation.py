@@ -10,8 +10,9 @@ import pytest
 from service.core.errors import InvalidRequest, ServiceBusy, Unavailable
 from service.core.process.concurrency import FairPlaces, ReaderPlaces
 from service.core.process.temporary_files import FULL_DISK_MESSAGE
-from service.datasets import large_simulation
-from service.datasets.large_simulation import SECONDS, count_steps, name_times, simulate_outputs
+from service.datasets import data_child, large_simulation
+from service.datasets.data_child import SECONDS
+from service.datasets.large_simulation import count_steps, name_times, simulate_outputs
 from sysid.core.child_processes import OUT_OF_PROCESSOR_TIME
 from sysid.data.records import Channel, History
 from sysid.models.catalogue.load import load_model
@@ -107,30 +108,30 @@ def answer(code: int, stdout: bytes = b"", stderr: bytes = b"") -> Any:
 
 
 def test_a_child_that_takes_too_long_is_ended(always_in_child: pytest.MonkeyPatch) -> None:
-    always_in_child.setattr(large_simulation, "run_child", answer(OUT_OF_PROCESSOR_TIME))
+    always_in_child.setattr(data_child, "run_child", answer(OUT_OF_PROCESSOR_TIME))
     assert f"more than {SECONDS:g} s of processor time" in read_fault()[1]
 
     def wait(*_args: Any, **_options: Any) -> None:
         raise subprocess.TimeoutExpired("", 1)
 
-    always_in_child.setattr(large_simulation, "run_child", wait)
+    always_in_child.setattr(data_child, "run_child", wait)
     assert "needs more than 240 s" in read_fault()[1]
 
 
 def test_a_child_that_the_system_ends_had_too_little_memory(
     always_in_child: pytest.MonkeyPatch,
 ) -> None:
-    always_in_child.setattr(large_simulation, "run_child", answer(-9))
+    always_in_child.setattr(data_child, "run_child", answer(-9))
     assert "2048 MiB of memory" in read_fault()[1]
 
 
 def test_other_ends_of_a_child_are_told_as_what_they_are(
     always_in_child: pytest.MonkeyPatch,
 ) -> None:
-    always_in_child.setattr(large_simulation, "run_child", answer(0, b'{"is_disk_full": true}'))
+    always_in_child.setattr(data_child, "run_child", answer(0, b'{"is_disk_full": true}'))
     with pytest.raises(Unavailable, match=FULL_DISK_MESSAGE):
         run(load_model("fopdt"), FOPDT, make_input())
-    always_in_child.setattr(large_simulation, "run_child", answer(1, stderr=b"no such module"))
+    always_in_child.setattr(data_child, "run_child", answer(1, stderr=b"no such module"))
     with pytest.raises(RuntimeError, match="no such module"):
         run(load_model("fopdt"), FOPDT, make_input())
 
