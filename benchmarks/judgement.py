@@ -37,11 +37,11 @@ from service.cli.common import apply_setting
 from service.jobs.job_schemas import JobIn
 from service.jobs.to_core import read_run_settings
 from sysid.core.errors import SysidError
+from sysid.core.findings import Finding
 from sysid.core.text import rewrite_settings
 from sysid.identification.identify import identify_records
 from sysid.identification.identify_arguments import read_records
 from sysid.models.catalogue.load import resolve_model
-from sysid.results.findings import Finding
 
 SEEDS, QUICK = 10, 1
 FIRST_SEED = 71_000

@@ -8,6 +8,7 @@ from math import inf
 import numpy as np
 
 from sysid.core.errors import DivergedEverywhere, NothingIdentifiable, SysidError
+from sysid.core.findings import Finding, note
 from sysid.core.jit import read_clock
 from sysid.core.settings import FoundNoiseModel, GeneticAlgorithm, StartKind
 from sysid.core.threads import use_one_thread
@@ -75,7 +76,6 @@ from sysid.noise_models.generalised_least_squares import resolve_noise_model
 from sysid.residuals.feedback import describe_feedback
 from sysid.residuals.onset_delay import estimate_onset_delays
 from sysid.residuals.residual_tests import list_residual_series, run_residual_tests
-from sysid.results.findings import Finding, note
 from sysid.results.identification import Identification
 from sysid.results.result import Agreements, FitPercent, Identifiability, KnownBefore
 from sysid.search.refine import refine_candidates

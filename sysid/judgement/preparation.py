@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from sysid.core.findings import Finding, note
 from sysid.core.types import FloatArray
 from sysid.kernels.signals.past_reads import list_delayed_values
 from sysid.models.unit_checks import (
@@ -14,7 +15,6 @@ from sysid.models.unit_checks import (
 from sysid.residuals.onset_delay import find_unprompted_output
 from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.sandwich import MIN_REPEATS, count_repeats
-from sysid.results.findings import Finding, note
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 
