@@ -607,8 +607,8 @@ class Recording:
         Raises
         ------
         InvalidRecord
-            If a channel is missing, or is both an input and an output. If an input has missing
-            values, or an output has no value. If the recording has several segments.
+            If a channel is missing, or is both an input and an output, or has no value. If the
+            recording has several segments.
         """
         for fault in find_shared_channels(inputs, outputs).values():
             raise InvalidRecord(fault)
@@ -629,12 +629,6 @@ class Recording:
             name,
             tuple(c for c in self.channels if c.name not in {*inputs.values(), *outputs.values()}),
         )
-
-    def to_records(
-        self, inputs: Mapping[str, str], outputs: Mapping[str, str], name: str = ""
-    ) -> tuple["Record", ...]:
-        """Return every segment as one experiment, on its own times; without segments, one."""
-        return tuple(part.to_record(inputs, outputs, name) for part in self.split_segments())
 
     def split_segments(self) -> tuple["Recording", ...]:
         """Return every segment as a recording on its own times; without segments, this one.
@@ -689,14 +683,30 @@ def _shift_to_segment(channel: Channel, segment: Segment) -> Channel:
 
 
 def _to_input(channel: Channel, role: str) -> Channel:
-    missing = np.flatnonzero(~np.isfinite(channel.values))
-    if missing.size:
-        raise InvalidRecord(
-            f"input {role!r} (channel {channel.name!r}) has {missing.size} missing values (NaN), "
-            f"the first at t = {channel.times[missing[0]]:g} s. An input needs a value at every "
-            "sample. Trim the recording or fill the gaps."
-        )
-    return replace(channel, name=role, history=trim_missing_history(channel.history))
+    """Make a channel an input: samples without a value are no samples, as missing rows are none."""
+    known = select_known(channel)
+    return replace(known, name=role, history=trim_missing_history(channel.history))
+
+
+def select_known(channel: Channel) -> Channel:
+    """Return a channel without the samples that have no value; itself if all have one.
+
+    Raises
+    ------
+    InvalidRecord
+        If no sample has a value.
+    """
+    is_known = np.isfinite(channel.values)
+    if is_known.all():
+        return channel
+    if not is_known.any():
+        raise InvalidRecord(f"channel {channel.name!r} has no value: all are missing (NaN)")
+    return replace(
+        channel,
+        times=channel.times[is_known],
+        values=channel.values[is_known],
+        repeats=None if channel.repeats is None else channel.repeats[is_known],
+    )
 
 
 def trim_missing_history(history: History | None) -> History | None:

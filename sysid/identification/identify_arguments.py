@@ -17,6 +17,7 @@ from sysid.data.foreign_tables import (
     read_columns,
 )
 from sysid.data.holds import MEANS, HoldSetting
+from sysid.data.outages import extract_records
 from sysid.data.records import Channel, Record, Recording, to_channel
 from sysid.data.value_checks import find_infinite_value
 from sysid.models.channel_assignment import (
@@ -159,7 +160,7 @@ def _read_one(
         raise InvalidRecord(_describe_wrong_data(data))
     inputs = {signal.name: assigned.by_signal[signal.name] for signal in model.inputs}
     outputs = {output.name: assigned.by_signal[output.name] for output in model.outputs}
-    for record in recording.to_records(inputs, outputs):
+    for record in extract_records(recording, inputs, outputs):
         yield record, assigned
 
 
