@@ -189,7 +189,7 @@ def identify(
             ).records
     from sysid.core.jit import announce_compilation, read_clock
 
-    printed = [*read.notes]
+    printed = [*read.notes, *_print_events(read.records)]
     begun = read_clock()
     with _report_core_faults(), announce_compilation(err.print):
         result = _run_identification(
@@ -411,6 +411,13 @@ def print_result(
     _print_posterior(result.posterior)
     _print_notes(warning for warning in result.warnings if warning not in printed)
     _print_notes(list_untold_reasons(result.parameters, result.findings))
+
+
+def _print_events(records: "Sequence[Record]") -> list[str]:
+    """Print what happened to the recordings, and return it."""
+    events = list(dict.fromkeys(one.sentences for record in records for one in record.findings))
+    _print_notes(events)
+    return events
 
 
 def _print_notes(warnings: Iterable[str]) -> None:

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from sysid.data.outages import extract_records
 from sysid.data.records import HoldSetting, Record, Recording
+from sysid.inspection.inspect import extract_inspected
 from sysid.models.model import Model
 
 
@@ -38,7 +38,7 @@ class SignalChannels:
             If a channel is missing, or cannot be that signal.
         """
         held = recording.replace_holds(dict(self.holds))
-        return extract_records(held, dict(self.inputs), dict(self.outputs), name)
+        return extract_inspected(held, dict(self.inputs), dict(self.outputs), name)
 
 
 def map_channels(

@@ -97,6 +97,10 @@ class Finding:
         Status that these have then.
     reason : str
         Why, as it follows the status of a parameter that has no move.
+    channels : tuple of str
+        Channels of the recording that it is about.
+    spans : tuple of (float, float)
+        Where in the recording it is, from a time to a time (s); none if it is everywhere.
     """
 
     explanation: str
@@ -110,6 +114,8 @@ class Finding:
     parameters: tuple[str, ...] = ()
     status: EstimateStatus = "dependent"
     reason: str = ""
+    channels: tuple[str, ...] = ()
+    spans: tuple[tuple[float, float], ...] = ()
 
     @property
     def sentences(self) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.core.errors import InvalidRecord, suggest_name
+from sysid.core.findings import Finding
 from sysid.core.text import append_unit
 from sysid.core.types import BoolArray, FloatArray
 from sysid.data.foreign_tables import (
@@ -28,8 +29,8 @@ from sysid.data.holds import HOLDS as HOLDS
 from sysid.data.holds import Hold as Hold
 from sysid.data.holds import HoldChoice, choose_hold
 from sysid.data.holds import HoldSetting as HoldSetting
-from sysid.data.table_rules import TimeAxis, tell_notes
-from sysid.data.value_checks import describe_missing_values, find_infinite_value
+from sysid.data.table_rules import TimeAxis
+from sysid.data.value_checks import find_infinite_value
 
 REGULARITY_TOLERANCE = 1e-2
 """Largest deviation of regular times from a uniform grid, as a part of the period.
@@ -385,8 +386,7 @@ def _iterate_channels(group: Any, owner: str) -> Iterator[Channel]:
 def to_channel(column: Column, otherwise: str = "") -> Channel:
     """Read a column of a table as a channel; `otherwise` is its name if it has none.
 
-    What is refused or reported of a file is so of a table: infinite and missing values, and times
-    that repeat.
+    What is refused of a file is so of a table: infinite values, and times that repeat.
     """
     name, (times, start) = column.name or otherwise, column.axis
     channel = Channel(name, times, column.values, column.unit, started_at=start)
@@ -399,7 +399,6 @@ def to_channel(column: Column, otherwise: str = "") -> Channel:
         )
     if fault := find_infinite_value([channel]):
         raise InvalidRecord(fault)
-    tell_notes(describe_missing_values([channel]))
     return channel
 
 
@@ -743,6 +742,8 @@ class Record:
     others : tuple of Channel
         What was recorded beside them, on the same clock. No simulation reads it, and a part of a
         record keeps all of it. Explanations of residuals look there for another input.
+    findings : tuple of Finding
+        What happened to the recording that it was made from.
 
     Examples
     --------
@@ -757,6 +758,7 @@ class Record:
     outputs: tuple[Channel, ...]
     name: str = ""
     others: tuple[Channel, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     if TYPE_CHECKING:
 
@@ -766,6 +768,7 @@ class Record:
             outputs: Channels,
             name: str = "",
             others: tuple[Channel, ...] = (),
+            findings: tuple[Finding, ...] = (),
         ) -> None: ...
 
     def __post_init__(self) -> None:

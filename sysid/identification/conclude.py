@@ -54,6 +54,7 @@ from sysid.judgement.open_terms import find_open_terms
 from sysid.judgement.preparation import (
     find_early_responses,
     find_few_repeats,
+    find_record_events,
     find_unit_faults,
     find_useless_prediction,
 )
@@ -257,6 +258,7 @@ def _build_identification(
             *find_unit_faults(problem),
             *find_useless_prediction(problem),
             *find_few_repeats(problem, analysis),
+            *(find_record_events(problem, explanations) if compares_orders else ()),
             *_list_notes("unequal noise", describe_unequal_noise(problem, metrics.channels)),
             *_list_notes(
                 "exchange",

@@ -1,6 +1,6 @@
 """Preparation: what is known of records and model before any estimate."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -32,6 +32,16 @@ def find_unit_faults(problem: Problem) -> tuple[Finding, ...]:
             )
         ),
     )
+
+
+def find_record_events(problem: Problem, explained: Sequence[Finding]) -> Iterator[Finding]:
+    """Find what happened to the recordings, unless it is an explanation of the residuals already.
+
+    Each recording was inspected before it was cut into experiments.
+    """
+    told = {one.explanation for one in explained}
+    events = dict.fromkeys(event for record in problem.records for event in record.findings)
+    yield from (event for event in events if event.explanation not in told)
 
 
 def find_early_responses(problem: Problem) -> Iterator[Finding]:
