@@ -17,6 +17,7 @@ from sysid.core.child_processes import limit_resources
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 from sysid.data.value_checks import find_infinite_value
+from sysid.inspection.inspect import inspect_recording
 
 
 def main() -> int:
@@ -53,7 +54,7 @@ def _convert_file(task: dict[str, Any], limits: UploadLimits) -> list[str]:
         write_recording(recording, task["target"])
     except ValueError as error:
         raise UnreadableFile(str(error)) from None
-    return messages
+    return [*messages, *(one.sentences for one in inspect_recording(recording))]
 
 
 def read_file(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Recording, list[str]]:

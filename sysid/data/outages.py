@@ -225,7 +225,7 @@ def extract_records(
     )
 
 
-def _cut_out(recording: Recording, cuts: Sequence[Cut], used: Collection[str]) -> list[Recording]:
+def _cut_out(recording: Recording, cuts: Sequence[Cut], used: set[str]) -> list[Recording]:
     """Cut out the experiments in which all used channels have values; the whole without cuts."""
     if not cuts:
         return [recording]

@@ -17,10 +17,9 @@ def find_limits(signal: Signal) -> Iterator[Finding]:
     if not signal.is_told or signal.is_held or np.mean(signal.steps == 0) > _STILL_SHARE:
         return
     values, (starts, lengths) = signal.values, signal.runs
-    levels, counts = np.unique(values, return_counts=True)
     for index, beside in ((-1, -2), (0, 1)):
-        limit = float(levels[index])
-        if not are_many(int(counts[index]), values.size):
+        limit, next_level = float(signal.levels[index]), float(signal.levels[beside])
+        if not are_many(int(np.count_nonzero(values == limit)), values.size):
             continue
         at_limit = values[starts] == limit
         runs = [
@@ -31,7 +30,7 @@ def find_limits(signal: Signal) -> Iterator[Finding]:
             if _is_cut_off(signal, start)
         ]
         count = sum(length for _, length in runs)
-        if are_many(count, values.size) and count > _MORE * counts[beside]:
+        if are_many(count, values.size) and count > _MORE * np.count_nonzero(values == next_level):
             yield build_finding(
                 "limit of a sensor",
                 "sensor",

@@ -23,7 +23,7 @@ def find_quantum(signal: Signal) -> float | None:
     """Find the step in which the values of a moving signal come; None if it is fine, or none."""
     if not signal.is_told or not signal.quantum > 0:
         return None
-    levels = np.unique(signal.values)
+    levels = signal.levels
     counts = (levels - levels[0]) / signal.quantum
     if np.max(np.abs(counts - np.rint(counts))) > _GRID_TOLERANCE * max(counts[-1], 1.0):
         return None
@@ -40,7 +40,7 @@ def find_quantisation(signal: Signal) -> Iterator[Finding]:
     """Find values that come in coarse steps."""
     quantum = find_quantum(signal)
     if quantum is not None:
-        levels = np.unique(signal.values).size
+        levels = signal.levels.size
         yield build_finding(
             "quantisation",
             "input" if signal.role == "input" else "sensor",

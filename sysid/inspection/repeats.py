@@ -1,6 +1,7 @@
 """Repeats: values that are polled faster than they are new, stored by a band, or stuck."""
 
 from collections.abc import Iterator
+from math import sqrt
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from sysid.inspection.signal import Signal, build_finding, find_limited
 _MIN_RUNS = 10
 _EVEN_SHARE = 0.9  # of the runs that last as long as their median, give or take a sample
 _FRESH_SHARE = 0.9  # of the runs, that have a value of their own
+_SMOOTH = 0.5  # correlation of a value with the one before, of a plant that is polled
+_DEVIATIONS = 3.0  # of the correlation of values without any (Bartlett 1946)
 _REPEATED_SHARE = 0.2  # of the samples: readings that equal the one before
 _BAND_SHARE = 0.1  # of the median move: the smallest one, if moves are stored by a band
 _STUCK = 10  # readings in a row that equal the one before
@@ -67,8 +70,18 @@ def _find_poll(signal: Signal) -> int:
         return 0
     every = int(np.median(lengths))
     is_even = np.abs(lengths - every) <= (1 if every > 2 else 0)
-    is_fresh = np.unique(signal.values).size >= _FRESH_SHARE * signal.runs.lengths.size
-    return every if every > 1 and is_fresh and np.mean(is_even) >= _EVEN_SHARE else 0
+    is_fresh = signal.levels.size >= _FRESH_SHARE * signal.runs.lengths.size
+    if every < 2 or not is_fresh or np.mean(is_even) < _EVEN_SHARE:
+        return 0
+    return every if signal.role == "output" or _is_smooth(signal) else 0
+
+
+def _is_smooth(signal: Signal) -> bool:
+    """Whether the values of runs follow each other; levels that were drawn for a test do not."""
+    values = signal.values[signal.runs.starts]
+    values = values - np.mean(values)
+    correlation = float(values[1:] @ values[:-1]) / float(values @ values)
+    return correlation >= max(_SMOOTH, _DEVIATIONS / sqrt(values.size))
 
 
 def _find_band(signal: Signal) -> float:

@@ -64,7 +64,7 @@ def _restarts(times: FloatArray, places: IntArray) -> bool:
     """Whether each time that goes back begins a part that is earlier for many rows."""
     parts = np.split(times, places)
     return all(
-        min(earlier.size, np.count_nonzero(later < earlier[-1])) >= _MIN_ROWS
+        earlier.size >= _MIN_ROWS and int(np.count_nonzero(later < earlier[-1])) >= _MIN_ROWS
         for earlier, later in pairwise(parts)
     )
 

@@ -74,10 +74,14 @@ class Signal:
         return np.diff(self.values)
 
     @cached_property
+    def levels(self) -> FloatArray:
+        """Values that occur, ascending."""
+        return np.unique(self.values)
+
+    @cached_property
     def quantum(self) -> float:
         """Smallest difference between two values that differ; 0 without one."""
-        levels = np.unique(self.values)
-        gaps = np.diff(levels)
+        gaps = np.diff(self.levels)
         real = gaps[gaps > 1e-9 * self.span]
         return float(np.min(real)) if real.size else 0.0
 

@@ -8,7 +8,7 @@ import numpy as np
 from sysid.core.findings import Finding
 from sysid.core.robust import estimate_deviation
 from sysid.core.types import FloatArray
-from sysid.inspection.signal import Signal, build_finding
+from sysid.inspection.signal import Signal
 
 
 class _Conversion(NamedTuple):
@@ -45,8 +45,8 @@ def find_unit_change(signal: Signal) -> Iterator[Finding]:
     if not signal.is_told or signal.is_held:
         return
     deviation = estimate_deviation(signal.steps)
-    jumps = np.flatnonzero(np.abs(signal.steps) > _JUMP * deviation) if deviation > 0 else []
-    if not 1 <= len(jumps) <= 2:
+    jumps = np.flatnonzero(np.abs(signal.steps) > _JUMP * deviation)
+    if not (deviation > 0 and 1 <= jumps.size <= 2):
         return
     place = int(jumps[np.argmax(np.abs(signal.steps[jumps]))])
     before, after = _read_beside(signal.values, place)
@@ -65,14 +65,16 @@ def find_unit_change(signal: Signal) -> Iterator[Finding]:
             is_met = abs(told - after) <= error <= _CLEAR_SHARE * abs(after - before)
             if is_met and old * scale / _SCALED < new < old * scale * _SCALED:
                 moment = float(signal.times[place + 1])
-                yield build_finding(
+                yield Finding(
                     "change of a unit",
                     "sensor",
+                    "serious",
+                    f"{signal.name} changes its unit at {moment:.6g} s",
                     f"{signal.name} jumps from {before:.4g} to {after:.4g} at {moment:.6g} s, as "
                     f"if its unit changed from {text}.",
-                    (signal.name,),
-                    ((moment, float(signal.times[-1])),),
                     "Convert that part, or cut the record there.",
+                    channels=(signal.name,),
+                    spans=((moment, float(signal.times[-1])),),
                 )
                 return
 

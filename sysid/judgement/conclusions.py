@@ -31,6 +31,7 @@ _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
 _OF_RECORD = (
     "constant output",
     "constant input",
+    "change of a unit",
     "exchanged channels",
     "feedback",
 )  # then nothing else says anything

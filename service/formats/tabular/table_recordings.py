@@ -268,9 +268,8 @@ def _repair_order(
     """Repair the order of rows, and tell how; return where each measurement begins, too."""
 
     def are_equal(rows: IntArray) -> BoolArray:
-        return np.all(
-            [_are_same(values[rows], values[rows - 1]) for values in table.values], axis=0
-        )
+        same = [_are_same(values[rows], values[rows - 1]) for values in table.values]
+        return np.asarray(np.all(same, axis=0))
 
     order = repair_order(clock.seconds, are_equal)
     if order is None:
@@ -286,7 +285,7 @@ def _repair_order(
 
 
 def _are_same(values: ColumnValues, others: ColumnValues) -> BoolArray:
-    return (values == others) | ((values != values) & (others != others))
+    return np.asarray((values == others) | ((values != values) & (others != others)))
 
 
 def _check_order(times: FloatArray, starts: IntArray, table: Table, notes: list[str]) -> None:
