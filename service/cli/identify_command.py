@@ -179,7 +179,7 @@ def identify(
     _refuse_same_file(data, validation)
     reading = FileOptions(sample_time, tuple(split_names(segments)))
     recording = read_input_file(data, reading)
-    body, loaded = check_body(unchecked, max(1, len(recording.segments)))
+    body, loaded = check_body(unchecked, _count_most_experiments(recording))
     with _report_core_faults():
         read = _extract_records(recording, Path(name_file(data)), loaded, body)
         validation_records: Sequence[Record] = ()
@@ -411,6 +411,13 @@ def print_result(
     _print_posterior(result.posterior)
     _print_notes(warning for warning in result.warnings if warning not in printed)
     _print_notes(list_untold_reasons(result.parameters, result.findings))
+
+
+def _count_most_experiments(recording: "Recording") -> int:
+    """Count the experiments of a recording if all channels were inputs."""
+    from sysid.data.outages import cut_segments, find_cuts
+
+    return sum(max(len(find_cuts(one, one.names)), 1) for one in cut_segments(recording))
 
 
 def _print_events(records: "Sequence[Record]") -> list[str]:

@@ -193,6 +193,10 @@ class DatasetDetailsOut(Answer):
     known_before: float | None = Field(
         default=None, description="recorded time before the start, s"
     )
+    outages: dict[str, list[tuple[float, float]]] = Field(
+        default={},
+        description="where a channel may have moved unseen, s: as an input it is cut there",
+    )
 
 
 class DatasetOut(Answer):

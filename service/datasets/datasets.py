@@ -48,6 +48,7 @@ from service.storage.storage_errors import ObjectDamaged, ObjectMissing, RowNotF
 from service.storage.tables import Dataset
 from sysid.core.errors import suggest_name
 from sysid.core.value_documents import encode
+from sysid.data.outages import list_unseen
 from sysid.data.records import Channel, Recording
 from sysid.figures.decimate import decimate
 from sysid.inspection.inspect import inspect_recording
@@ -254,6 +255,7 @@ def describe_recording(
             **details,
             "started_at": None if start is None else start.isoformat(),
             "warnings": [*details["warnings"], *list_unknown_unit_warnings(recording.channels)],
+            "outages": list_unseen(recording),
             "segments": [
                 {"start": s.start, "stop": s.stop, "origin": s.origin, "labels": dict(s.labels)}
                 for s in recording.segments

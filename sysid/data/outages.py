@@ -133,7 +133,7 @@ def find_unseen(channel: Channel, recording: Recording) -> list[Outage]:
     return [
         one
         for one in outages
-        if _measure_bridging(stretches, one.rows, channel.effective_hold == "zero")
+        if _measure_bridging(stretches, one.rows, channel.hold_choice.hold == "zero")
         > _UNSEEN_SHARE * variance
     ]
 
@@ -166,16 +166,23 @@ def _differ(stretches: list[FloatArray]) -> bool:
 def find_cuts(recording: Recording, inputs: Collection[str]) -> tuple[Cut, ...]:
     """Find the experiments of one measurement, cut where an input may have moved unseen.
 
-    Empty if there is one, the whole. Experiments that are far shorter than the longest are left
-    out: they would bound the time lags that are searched.
+    Empty if there is one, the whole.
     """
-    start, stop = recording.start, recording.stop
     outages = [
-        one
+        (one.start, one.stop)
         for channel in recording.channels
         if channel.name in inputs
         for one in find_unseen(channel, recording)
     ]
+    return list_cuts(recording.start, recording.stop, outages)
+
+
+def list_cuts(start: float, stop: float, outages: Sequence[tuple[float, float]]) -> tuple[Cut, ...]:
+    """List the experiments between outages of a measurement (s); empty if there is none.
+
+    Experiments that are far shorter than the longest are left out: they would bound the time lags
+    that are searched.
+    """
     if not outages:
         return ()
     spans = list(_list_spans(start, stop, outages))
@@ -187,15 +194,62 @@ def find_cuts(recording: Recording, inputs: Collection[str]) -> tuple[Cut, ...]:
     )
 
 
+def list_unseen(recording: Recording) -> dict[str, list[tuple[float, float]]]:
+    """List the spans (s) in which each channel may have moved unseen, of those that have some.
+
+    Every segment is looked at by itself.
+    """
+    spans: dict[str, list[tuple[float, float]]] = {}
+    for part in cut_segments(recording):
+        for channel in part.channels:
+            if np.isfinite(channel.values).any() and (found := find_unseen(channel, part)):
+                spans.setdefault(channel.name, []).extend((one.start, one.stop) for one in found)
+    return spans
+
+
+def count_experiments(
+    unseen: Mapping[str, Sequence[tuple[float, float]]],
+    measurements: Sequence[tuple[float, float]],
+    inputs: Collection[str],
+) -> int:
+    """Count the experiments of measurements, each from a time to a time (s).
+
+    `unseen` is that of `list_unseen`.
+    """
+    spans = [(a, b) for name in inputs for a, b in unseen.get(name, ())]
+    return sum(
+        max(len(list_cuts(start, stop, [one for one in spans if start <= one[0] <= stop])), 1)
+        for start, stop in measurements
+    )
+
+
+def cut_segments(recording: Recording) -> list[Recording]:
+    """Cut a recording into its segments, on its own time axis; itself if there is none."""
+    if not recording.segments:
+        return [recording]
+    return [
+        replace(
+            recording,
+            segments=(),
+            channels=tuple(
+                channel.slice_time(segment.start, segment.stop)
+                for channel in recording.channels
+                if np.any((channel.times >= segment.start) & (channel.times <= segment.stop))
+            ),
+        )
+        for segment in recording.segments
+    ]
+
+
 def _list_spans(
-    start: float, stop: float, outages: Collection[Outage]
+    start: float, stop: float, outages: Collection[tuple[float, float]]
 ) -> Iterator[tuple[float, float]]:
     """List the spans (s) between outages, which may overlap."""
     since = start
-    for outage in sorted(outages):
-        if outage.start >= since:
-            yield since, outage.start
-        since = max(since, outage.stop)
+    for begin, end in sorted(outages):
+        if begin >= since:
+            yield since, begin
+        since = max(since, end)
     yield since, max(stop, since)
 
 

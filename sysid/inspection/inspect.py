@@ -10,8 +10,8 @@ from itertools import chain
 
 from sysid.core.findings import Finding
 from sysid.data.foreign_tables import Labelled
-from sysid.data.outages import extract_records
-from sysid.data.records import Channel, Record, Recording, Segment
+from sysid.data.outages import cut_segments, extract_records
+from sysid.data.records import Channel, Record, Recording
 from sysid.inspection.gaps import find_gaps
 from sysid.inspection.half_way import find_half_way_values
 from sysid.inspection.limits import find_limits
@@ -72,26 +72,17 @@ def inspect_recording(
 
     Every segment is inspected by itself. What several of them have is told once.
     """
-    chosen = [one for one in recording.channels if roles is None or one.name in roles]
-    parts = [_cut_segment(chosen, segment) for segment in recording.segments] or [chosen]
+    chosen = tuple(one for one in recording.channels if roles is None or one.name in roles)
     found = [
         finding
-        for part in parts
-        if part
-        for finding in _inspect_part(replace(recording, channels=tuple(part)), roles or {})
+        for part in cut_segments(replace(recording, channels=chosen))
+        if part.channels
+        for finding in _inspect_part(part, roles or {})
     ]
     merged: dict[tuple[str, tuple[str, ...]], list[Finding]] = {}
     for finding in found:
         merged.setdefault((finding.explanation, finding.channels), []).append(finding)
     return tuple(_join(several) for several in merged.values())
-
-
-def _cut_segment(channels: Sequence[Channel], segment: Segment) -> list[Channel]:
-    return [
-        channel.slice_time(segment.start, segment.stop)
-        for channel in channels
-        if channel.times[0] <= segment.stop and channel.times[-1] >= segment.start
-    ]
 
 
 def _join(several: Sequence[Finding]) -> Finding:
