@@ -44,7 +44,7 @@ class Signal:
     role: Role | None = None
 
     @cached_property
-    def known(self) -> Channel:
+    def measured_part(self) -> Channel:
         """The samples with a value."""
         return select_known(self.whole)
 
@@ -56,12 +56,12 @@ class Signal:
     @property
     def times(self) -> FloatArray:
         """Times (s) of the samples with a value."""
-        return self.known.times
+        return self.measured_part.times
 
     @property
     def values(self) -> FloatArray:
         """Their values."""
-        return self.known.values
+        return self.measured_part.values
 
     @cached_property
     def span(self) -> float:
@@ -94,7 +94,7 @@ class Signal:
     @cached_property
     def is_held(self) -> bool:
         """Whether it is a command: piecewise constant, and no output."""
-        return self.role != "output" and self.known.effective_hold == "zero"
+        return self.role != "output" and self.measured_part.effective_hold == "zero"
 
     @property
     def is_told(self) -> bool:
