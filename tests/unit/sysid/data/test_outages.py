@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sysid.core.types import BoolArray, FloatArray
-from sysid.data.outages import extract_records, find_cuts, find_outages
+from sysid.data.outages import extract_records, find_cuts, find_outages, list_cuts
 from sysid.data.records import Channel, Recording
 
 SAMPLES = 600
@@ -108,3 +108,8 @@ def test_an_input_that_is_logged_at_its_changes_is_not_silent_between_them() -> 
     times = np.arange(0.0, moments[-1] + 400.0)
     recording = Recording((command, Channel("y", times, np.sin(times))))
     assert find_cuts(recording, ["u"]) == ()
+
+
+def test_outages_that_overlap_are_one() -> None:
+    cuts = list_cuts(0.0, 100.0, [(20.0, 60.0), (30.0, 40.0)])
+    assert [(one.known_from, one.stop) for one in cuts] == [(0.0, 20.0), (60.0, 100.0)]

@@ -2,12 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.judgement_kinds import draw_case
 from lagid import Channel, Record, Recording, check_recording, identify
+from service.formats.mcap.mcap_files import write_recording
+from service.formats.recordings import read_with_notes
 from sysid.core.types import FloatArray
 from sysid.data.records import Segment
 from sysid.inspection.inspect import inspect_recording
@@ -140,3 +143,24 @@ def test_the_result_of_a_cut_record_says_so() -> None:
     found = identify("fopdt", replace(recording, channels=channels))
     assert "the record is cut" in " ".join(found.warnings)
     assert any(one.name == "x(0)[2]" for one in found.parameters)
+
+
+def test_levels_that_were_drawn_for_a_test_are_no_polled_sensor() -> None:
+    levels = np.repeat(np.random.default_rng(4).uniform(0, 1, SAMPLES // 10), 10)
+    assert find(lambda _: levels) == []
+
+
+def test_a_jump_that_a_conversion_meets_by_chance_is_no_change_of_a_unit() -> None:
+    def jump(values: FloatArray) -> FloatArray:
+        late = np.arange(SAMPLES) >= 300
+        return np.where(late, values + 0.8 * values[300] + 32.0, values)
+
+    assert find(jump) == []
+
+
+def test_what_an_mcap_file_says_is_inspected_like_a_table(tmp_path: Path) -> None:
+    times = np.delete(PERIOD * np.arange(SAMPLES), np.arange(100, 200))
+    values = np.delete(build_signal(), np.arange(100, 200))
+    write_recording(Recording((Channel("y", times, values),)), tmp_path / "gap.mcap")
+    recording, _ = read_with_notes(tmp_path / "gap.mcap")
+    assert [one.explanation for one in check_recording(recording)] == ["outage"]
