@@ -209,8 +209,12 @@ def is_detectable(case: Case, found: Identification) -> bool:
         return False
     if kind.group == "dirty" or kind.detectable == "always":
         return True
-    ((fitted,),) = found.simulated
-    missed = (case.clean[-fitted.size :] - fitted) / case.noise_sd
+    records = read_records(resolve_model(case.model), case.recording, None).records
+    parts = []
+    for record, (fitted,) in zip(records, found.simulated, strict=True):
+        clean = case.clean[np.isin(case.logged["t"], record.outputs[0].times)]
+        parts.append((clean[-fitted.size :] - fitted) / case.noise_sd)
+    missed = np.concatenate(parts)
     missed = missed[np.isfinite(missed)]
     free = sum(one.is_free for one in found.parameters)
     return bool(np.sum(missed**2) - free > 10.0 + 2.0 * np.log(missed.size))

@@ -54,7 +54,7 @@ def find_repeats(signal: Signal) -> Iterator[Finding]:
     if stuck := list(_find_stuck(signal)):
         where = ", ".join(f"{first:.6g} to {last:.6g} s" for first, last in stuck[:3])
         yield build_finding(
-            "stuck value",
+            "repeated reading",
             "sensor",
             f"{signal.name} does not move at all from {where}, and does everywhere else.",
             (signal.name,),

@@ -63,7 +63,7 @@ def store_means(values: FloatArray) -> FloatArray:
         (lambda y: round_to(y, 0.5), ["quantisation"]),
         (lambda y: round_to(y, 0.001), []),
         (lambda y: np.minimum(y, 23.0), ["limit of a sensor"]),
-        (stick, ["stuck value"]),
+        (stick, ["repeated reading"]),
         (resample, ["interpolated reading"]),
         (store_means, ["half-way values"]),
         (lambda y: np.where(np.arange(SAMPLES) < 300, y, 1.8 * y + 32.0), ["change of a unit"]),
