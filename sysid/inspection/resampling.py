@@ -6,11 +6,11 @@ import numpy as np
 
 from sysid.core.findings import Finding
 from sysid.core.types import BoolArray, FloatArray
-from sysid.inspection.quantisation import find_quantum
 from sysid.inspection.signal import Signal, build_finding
 
 _LINE_SHARE = 1e-6  # of the range: a bend
 _DRAWN_SHARE = 0.1  # of the samples that lie on lines; of measured ones none does
+_ONE_STEP, _PILED = 1.5, 3.0  # steps of the values; samples on lines for each that bends by one
 _LONG_LINE = 20  # samples: a command along longer lines is a ramp
 
 
@@ -24,16 +24,25 @@ def find_knots(times: FloatArray, values: FloatArray) -> BoolArray:
 
 
 def measure_drawn(values: FloatArray, is_knot: BoolArray) -> float:
-    """Measure the share of samples that lie on lines, and move."""
-    is_moving = np.concatenate([[True], np.diff(values) != 0])
-    return float(np.mean(~is_knot & is_moving))
+    """Measure the share of samples that lie on lines, and move.
+
+    Values in steps of a converter, or printed with few digits, lie on lines by chance. Then about
+    as many bend by one step, and there is no share.
+    """
+    steps = np.diff(values)
+    is_drawn = ~is_knot & np.concatenate([[True], steps != 0])
+    count = int(np.count_nonzero(is_drawn))
+    if not count:
+        return 0.0
+    quantum = float(np.min(np.abs(steps[steps != 0])))
+    bends = np.abs(np.diff(steps))[is_knot[1:-1]]
+    by_a_step = int(np.count_nonzero(bends < _ONE_STEP * quantum))
+    return count / values.size if count > _PILED * by_a_step else 0.0
 
 
 def find_resampling(signal: Signal) -> Iterator[Finding]:
     """Find values that were interpolated."""
     if not signal.is_told or signal.is_held or np.any(np.diff(signal.times) <= 0):
-        return
-    if find_quantum(signal) is not None:
         return
     is_knot = find_knots(signal.times, signal.values)
     share = measure_drawn(signal.values, is_knot)

@@ -61,6 +61,8 @@ def store_means(values: FloatArray) -> FloatArray:
         (lambda y: y, []),
         (repeat_each, ["repeated reading"]),
         (lambda y: round_to(y, 0.5), ["quantisation"]),
+        (lambda y: round_to(y, 0.15), ["quantisation"]),
+        (lambda y: round_to(y, 0.05), []),
         (lambda y: round_to(y, 0.001), []),
         (lambda y: np.minimum(y, 23.0), ["limit of a sensor"]),
         (stick, ["repeated reading"]),

@@ -50,7 +50,8 @@ def test_a_clock_that_restarts_begins_another_measurement() -> None:
 
 
 def test_two_values_at_one_time_are_refused() -> None:
-    rows = [(0.0, 1.0), (1.0, 1.0), (1.0, 2.0), (2.0, 1.0)]
+    rows = [(float(k), 1.0) for k in range(40)]
+    rows.insert(21, (20.0, 2.0))
     with pytest.raises(UnreadableFile, match="repeats"):
         read_recording(write(rows))
 
