@@ -117,6 +117,11 @@ class Operations(Exchange):
         return call("GET /v1/datasets/{}/signals", dataset, max_points=max_points)
 
     @fetch
+    def check_dataset(self, dataset: str) -> RestCall[documents.DatasetCheckDocument]:
+        """Fetch what happened to the recording of a dataset."""
+        return call("GET /v1/datasets/{}/check", dataset)
+
+    @fetch
     def lineage(self, dataset: str) -> RestCall[documents.LineageDocument]:
         """Fetch the lineage of a dataset: its sources, and everything made from it."""
         return call("GET /v1/datasets/{}/lineage", dataset)
@@ -424,6 +429,13 @@ class Operations(Exchange):
     def bands(self, run: str, max_points: int = 1000) -> RestCall[documents.BandsDocument]:
         """Fetch the 95 % confidence and prediction bands of the outputs."""
         return call("GET /v1/runs/{}/bands", run, max_points=max_points)
+
+    @fetch
+    def disturbances(
+        self, run: str, max_points: int = 1000
+    ) -> RestCall[documents.DisturbancesDocument]:
+        """Fetch the estimated disturbances with their 95 % bands."""
+        return call("GET /v1/runs/{}/disturbances", run, max_points=max_points)
 
     @fetch
     def simulate_run(

@@ -5,6 +5,7 @@ from math import isfinite
 from typing import NamedTuple
 
 from service.pages.forms.choices import write_choice
+from sysid.core.findings import Finding
 from sysid.core.text import (
     DASH,
     append_unit,
@@ -23,8 +24,8 @@ from sysid.models.equation_display import format_equations
 from sysid.models.model import Model
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import ResidualTest
-from sysid.results.findings import Finding, list_untold_reasons
-from sysid.results.parts import OrderComparison, OrderFit
+from sysid.results.findings import list_untold_reasons
+from sysid.results.parts import NoiseSource, OrderComparison, OrderFit
 from sysid.results.result import Result
 from sysid.results.summary import describe_search
 from sysid.uncertainty.estimates import Estimate, PosteriorParameter
@@ -208,6 +209,11 @@ def format_excess_bic(fit: OrderFit, comparison: OrderComparison) -> str:
     return format_criterion(fit.bic - lowest if isfinite(fit.bic) else None)
 
 
+def describe_noise_kind(source: NoiseSource) -> str:
+    """Describe what a source of noise is."""
+    return {"sensor": "sensor", "load": "slow load", "plant": "diffusion of a state"}[source.kind]
+
+
 def list_equations(model: Model) -> list[str]:
     """List the equations of a model as MathML."""
     return [equation.mathml for equation in format_equations(model)]
@@ -234,5 +240,6 @@ RESULT_FILTERS = {
     "told_orders": select_told_orders,
     "delay_text": format_delay_text,
     "excess_bic": format_excess_bic,
+    "noise_text": describe_noise_kind,
     "equations": list_equations,
 }

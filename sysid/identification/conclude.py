@@ -8,6 +8,7 @@ from math import inf
 import numpy as np
 
 from sysid.core.errors import DivergedEverywhere, NothingIdentifiable, SysidError
+from sysid.core.findings import Finding, note
 from sysid.core.jit import read_clock
 from sysid.core.settings import FoundNoiseModel, GeneticAlgorithm, StartKind
 from sysid.core.threads import use_one_thread
@@ -59,6 +60,7 @@ from sysid.judgement.open_terms import find_open_terms
 from sysid.judgement.preparation import (
     find_early_responses,
     find_few_repeats,
+    find_record_events,
     find_unit_faults,
     find_useless_prediction,
 )
@@ -81,7 +83,6 @@ from sysid.noise_models.generalised_least_squares import resolve_noise_model
 from sysid.residuals.feedback import describe_feedback
 from sysid.residuals.onset_delay import estimate_onset_delays
 from sysid.residuals.residual_tests import list_residual_series, run_residual_tests
-from sysid.results.findings import Finding, note
 from sysid.results.identification import Identification
 from sysid.results.result import Agreements, FitPercent, Identifiability, KnownBefore
 from sysid.search.refine import refine_candidates
@@ -269,6 +270,7 @@ def _build_identification(
             *find_unit_faults(problem),
             *find_useless_prediction(problem),
             *find_few_repeats(problem, analysis),
+            *(find_record_events(problem, explanations) if compares_orders else ()),
             *_list_notes("unequal noise", describe_unequal_noise(problem, metrics.channels)),
             *_list_notes(
                 "exchange",
@@ -357,7 +359,7 @@ def _build_identification(
         verdict=conclude_verdict(analysis.estimates, findings, declared),
         warnings=list_warnings(findings),
         substeps=problem.model.solver.substeps,
-        initial=_get_start(asked, best.starts),
+        initial=_get_start(problem, best.starts),
         plant_noise=describe_plant_noise(problem, theta, metrics.rms),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
         history=_extend_histories(best.state, best.ends),
@@ -397,11 +399,11 @@ def _describe_identifiability(uncertainty: Uncertainty | None) -> Identifiabilit
     return Identifiability(uncertainty.condition, uncertainty.groups, uncertainty.singular_values)
 
 
-def _get_start(asked: Problem, starts: StartComparison | None) -> StartKind | None:
+def _get_start(problem: Problem, starts: StartComparison | None) -> StartKind | None:
     """Get the start that the estimates assume; None for that of the model's document."""
     if starts is not None:
         return starts.own.name
-    initial = asked.settings.initial
+    initial = problem.settings.initial
     return None if initial == "auto" else initial
 
 
