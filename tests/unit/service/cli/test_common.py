@@ -75,6 +75,7 @@ def test_every_field_that_an_option_gives_is_told_at_that_option() -> None:
         "weights",
         "skip",
         "initial",
+        "commands",
         "algorithm",
         "priority",
         "reuse",
