@@ -8,7 +8,7 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from service.core.errors import Conflict
+from service.core.errors import BudgetExceeded, Conflict
 from service.formats.mcap.mcap_files import FitRole, FittedOutput
 from service.jobs.stored_run import StoredRun
 from service.repositories.run_rows import RunRepository
@@ -97,7 +97,7 @@ class StoredRunFigures:
             return experiments
         try:
             return add_bands(experiments, load_bands(session, store, stored))
-        except Conflict:  # no standard errors, or a dataset was deleted
+        except (BudgetExceeded, Conflict):  # no evaluations left, no standard errors, no dataset
             return experiments
 
     @cached_property
