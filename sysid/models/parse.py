@@ -229,10 +229,6 @@ def _read_noise(
 ) -> NoisePlaces:
     if value is None:
         return NoisePlaces()
-    if scope.form != "differential":
-        detail = "belongs to the differential form; a recursion predicts from measured values"
-        reader.add_fault("/noise", detail)
-        return NoisePlaces()
     equations_of = dict(zip(scope.states, trees, strict=True))
     return read_noise(reader, value, equations_of, scope.inputs, outputs)
 
@@ -363,7 +359,8 @@ def _read_polynomial_model(reader: DocumentReader, fields: Mapping[str, Any]) ->
     initial = read_initial_states(reader, fields.get("initial"), scope, MeasuredInitial())
     initial = derive_starts(reader, {output.name: initial[0]}, ())
     solver = read_solver(reader, fields.get("solver"), "polynomial")
-    _read_noise(reader, fields.get("noise"), scope, (), ())
+    measured = (Output(output.name, PastValue(output.name, "state"), output.unit),)
+    noise = _read_noise(reader, fields.get("noise"), scope, (equation.tree,), measured)
     reader.raise_faults()
     named = {parameter.name: get_interval(parameter) for parameter in equation.coefficients}
     whole = replace(scope, parameters={**named, **scope.parameters})
@@ -374,7 +371,7 @@ def _read_polynomial_model(reader: DocumentReader, fields: Mapping[str, Any]) ->
         form="polynomial",
         inputs=inputs,
         states=(output,),
-        outputs=(Output(output.name, PastValue(output.name, "state"), output.unit),),
+        outputs=measured,
         parameters=(*equation.coefficients, *parameters),
         equations=(equation.tree,),
         initial=initial,
@@ -384,6 +381,7 @@ def _read_polynomial_model(reader: DocumentReader, fields: Mapping[str, Any]) ->
         document={},
         terms=equation.terms,
         rule=equation.rule,
+        noise=noise,
     )
 
 
