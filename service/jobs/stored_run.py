@@ -32,6 +32,7 @@ from sysid.results.result import Result
 from sysid.uncertainty.estimates import Estimate
 
 if TYPE_CHECKING:
+    from sysid.core.settings import FitSettings
     from sysid.identification.fit_problems import FitRecords
     from sysid.identification.resimulate import FittedSignals
     from sysid.simulation.problem import Problem
@@ -139,12 +140,7 @@ class StoredRun:
 
         records = self.read_fit_records(session, store).estimation
         parameters = (*self.model.parameters, *build_initial_parameters(self.model, len(records)))
-        result = self.result
-        loss = {**self.body["loss"], "noise_model": result.noise_model if result else "white"}
-        body = {**self.body, "parameters": self._changes(parameters), "loss": loss}
-        settings = read_fit(body)
-        if result is not None and result.noise_deviations is not None:
-            settings = replace(settings, deviations=result.noise_deviations)
+        settings = self._read_settings(self._changes(parameters))
         return Problem.from_settings(self.model, records, settings)
 
     def resimulate(
@@ -165,8 +161,20 @@ class StoredRun:
         model, records = self.model_of_request, self.read_fit_records(session, store)
         substeps = model.solver.substeps if self.result is None else self.result.substeps
         initial = None if self.result is None else self.result.initial
-        settings = read_fit(self.body)
+        settings = self._read_settings(self.body["parameters"])
         return records, resimulate_run(model, records, settings, self.estimates, substeps, initial)
+
+    def _read_settings(self, changes: Mapping[str, Any]) -> "FitSettings":
+        """Read the settings of the fit, with the noise that the result found.
+
+        `changes` are those of parameters.
+        """
+        result = self.result
+        loss = {**self.body["loss"], "noise_model": result.noise_model if result else "white"}
+        settings = read_fit({**self.body, "parameters": changes, "loss": loss})
+        if result is not None and result.noise_deviations is not None:
+            settings = replace(settings, deviations=result.noise_deviations)
+        return settings
 
     def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
         """Select the changes of these parameters. The request may name unselected terms."""

@@ -394,7 +394,8 @@ class _EstimateSearch:
 
         It is as ordinary as the free run, so it takes strong odds. What was found has those of a
         defect, but for a closed loop, in which noise is a part of the input. The states may start
-        otherwise beside a filter.
+        otherwise beside a filter. An input that follows the residuals, and an unstable plant, show
+        that there is a controller.
         """
         problem = self.problem
         if not self._may_choose_noise() or explained.criterion == -inf:
@@ -408,22 +409,20 @@ class _EstimateSearch:
         first_order, spent = fit_first_order_criterion(problem, self.theta)
         self._budget.spend(found.evaluations + spent)
         gain = min(explained.criterion, first_order) - found.criterion
-        has_rival = gain <= STRONG_ODDS + max(explained.odds, 0.0)
-        if gain <= STRONG_ODDS or (has_rival and not self._has_feedback()):
+        if gain <= STRONG_ODDS:
+            return False
+        feedback = tuple(
+            find_feedback(problem, problem.predict(self.theta[None])[0], self.analysis)
+        )
+        has_controller = bool(feedback) or compute_growth(problem, self.theta) >= MIN_GROWTH
+        if gain <= STRONG_ODDS + max(explained.odds, 0.0) and not has_controller:
             return False
         values = dict(zip(problem.free_names, self.theta.tolist(), strict=True))
-        self.free_run = ReplacedRun(values, gain)
+        self.free_run = ReplacedRun(values, gain, feedback)
         self.starts, self._left = None, []
         equal = found.problem.rebuild(deviations=None)
         self._continue_with(equal, found.theta, found.sizes)
         return True
-
-    def _has_feedback(self) -> bool:
-        """Whether an input follows the residuals, or the plant is unstable: it has a controller."""
-        if compute_growth(self.problem, self.theta) >= MIN_GROWTH:
-            return True
-        simulated = self.problem.predict(self.theta[None])[0]
-        return any(find_feedback(self.problem, simulated, self.analysis))
 
     def _continue_with(
         self, problem: Problem, theta: FloatArray, added: Mapping[str, float] | None = None

@@ -184,6 +184,10 @@ def _build_identification(
         posterior = sample_posterior(problem, theta, analysis, others, state.seed, left, late)
         budget.spend(posterior.evaluations)
     feedback = list(find_feedback(problem, simulated, analysis))
+    replaced = best.free_run
+    if replaced is not None and not tests.passed:  # a filter that does not fit explains no loop
+        names = tuple(one.name for one in analysis.estimates if one.is_free)
+        feedback = feedback or [replace(one, parameters=names) for one in replaced.feedback]
     left, late = budget.count_left(), deadline.is_past_grace
     ahead, spent = compare_one_step(
         problem,
@@ -276,7 +280,11 @@ def _build_identification(
                 best.lowest_end.theta,
                 is_complete=noise.is_complete,
             ),
-            *(() if best.free_run is None else find_plant_noise(problem, *best.free_run)),
+            *(
+                ()
+                if replaced is None
+                else find_plant_noise(problem, replaced.values, replaced.gain)
+            ),
             *_list_notes(
                 "posterior", () if posterior is None else describe_posterior(posterior, estimates)
             ),

@@ -10,6 +10,7 @@ from sysid.core.units import is_blank_unit
 from sysid.kernels.signals.past_reads import is_difference
 from sysid.models.kalman_filter import is_noise_parameter
 from sysid.results.parts import NoiseSource, PlantNoise
+from sysid.simulation.data_bounds import find_signal_units
 from sysid.simulation.free_run import simulate_free_run
 from sysid.simulation.problem import Problem, compute_metrics
 
@@ -42,9 +43,11 @@ def _list_sources(
     """List the sensors, and the places of noise by the parameters of the filter."""
     units = {one.name: one.unit for one in (*problem.model.states, *problem.model.inputs)}
     units |= {output.name: output.unit for output in problem.model.outputs}
+    recorded = find_signal_units(problem.records)
+    units |= {name: unit for name, unit in recorded.items() if is_blank_unit(units.get(name))}
     for output in problem.model.outputs:
         size = sensor / problem.output_weights[output.name]
-        yield NoiseSource(output.name, "sensor", size, output.unit, None)
+        yield NoiseSource(output.name, "sensor", size, units[output.name], None)
     for parameter in filter(is_noise_parameter, values):
         kind, _, place = parameter[:-1].partition("[")
         size = values[parameter] * sensor

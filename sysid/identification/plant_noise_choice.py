@@ -21,6 +21,7 @@ from sysid.minima.minima import is_same_point
 from sysid.models.kalman_filter import is_noise_parameter, list_plant_noise
 from sysid.noise_models.first_order_fit import fit_first_order_noise
 from sysid.residuals.series import iterate_parts
+from sysid.results.findings import Finding
 from sysid.search.refine import refine_candidates
 from sysid.simulation.free_run import convert_to_free_run
 from sysid.simulation.noise_levels import add_noise_levels
@@ -32,10 +33,21 @@ _MOST_SIMULATIONS = 4000
 
 
 class ReplacedRun(NamedTuple):
-    """Estimates of a free run by squares, and by how much a filter lowers the criterion."""
+    """A free run by squares that a filter took the place of.
+
+    Attributes
+    ----------
+    values : mapping
+        Its estimates.
+    gain : float
+        By how much the filter lowers Schwarz's criterion.
+    feedback : tuple of Finding
+        The loop that its residuals show. A filter that fits leaves no trace of it.
+    """
 
     values: Mapping[str, float]
     gain: float
+    feedback: tuple[Finding, ...]
 
 
 class FilteredFit(NamedTuple):

@@ -229,6 +229,8 @@ def _read_noise(
 ) -> NoisePlaces:
     if value is None:
         return NoisePlaces()
+    if len(trees) < len(scope.states):  # the faults of the equations are told first
+        return NoisePlaces()
     equations_of = dict(zip(scope.states, trees, strict=True))
     return read_noise(reader, value, equations_of, scope.inputs, outputs)
 

@@ -6,10 +6,12 @@ import zipfile
 from pathlib import Path
 
 import httpx
+import pytest
 
 from service.api.app import create_app
 from service.client.client import Client
 from service.core.process.folder_lock import lock_folder, use_folder
+from service.datasets import stored_recordings
 from tests.support.service.commands import CommandResult, check_refusal, run_lagid
 from tests.support.service.web_app import recording, settings_of
 from tests.support.service.web_server import serve_in_thread
@@ -38,7 +40,11 @@ def test_a_running_service_is_backed_up_and_restored_elsewhere(tmp_path: Path) -
         assert client.content(data["id"]) == content
 
 
-def test_a_damaged_object_is_told_everywhere_and_healed_by_its_recording(tmp_path: Path) -> None:
+def test_a_damaged_object_is_told_everywhere_and_healed_by_its_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Another test may have read the same recording, and the process keeps the latest.
+    monkeypatch.setattr(stored_recordings, "_recording_cache", stored_recordings._RecordingCache())
     folder, other = tmp_path / "data", tmp_path / "other"
     with serve_in_thread(create_app(settings_of(folder))) as url, Client(url) as client:
         data = client.add_dataset(recording(), "steps")

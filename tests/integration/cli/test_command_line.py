@@ -100,7 +100,7 @@ def test_a_command_that_is_called_wrongly_exits_with_2(data: Path) -> None:
     line = check_refusal(
         run_lagid("identify", data, "--model", "fopdt", "--noise-model", "pink"), 2
     )
-    assert "need 'auto', 'white', 'ar1', 'plant' or 'load'" in line
+    assert "need 'auto', 'white', 'ar1', 'plant', 'load' or 'drift'" in line
 
 
 @pytest.mark.parametrize(

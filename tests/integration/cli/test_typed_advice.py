@@ -47,6 +47,7 @@ OPEN = "…"
 VALUES: dict[tuple[str, str], list[tuple[str, ...]]] = {
     ("hold", OPEN): [("u", hold) for hold in HOLDS],
     ("loss", "scale"): [("scale", "0.3")],
+    ("loss", "noise_model"): [("noise_model", kind) for kind in ("white", "load", "drift")],
     ("parameters", OPEN): [("upper", "0.5")],
     ("parameters", "physical"): [("physical", "lower")],
 }

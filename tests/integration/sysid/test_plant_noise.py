@@ -40,7 +40,9 @@ def make_record(load: float, correlation: float, walk: float = 0.0, seed: int = 
 
 def build_record(u: FloatArray, y: FloatArray) -> Record:
     times = PERIOD * np.arange(u.size)
-    return Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y + 20.0),))
+    return Record(
+        (Channel("u", times, u, "%", hold="zero"),), (Channel("y", times, y + 20.0, "°C"),)
+    )
 
 
 def test_a_load_is_told_and_the_plant_is_found() -> None:
@@ -52,9 +54,9 @@ def test_a_load_is_told_and_the_plant_is_found() -> None:
     assert found.noise_colour == "white"
     assert found.plant_noise is not None
     sensor, load = found.plant_noise.sources
-    assert (sensor.place, sensor.kind, sensor.unit) == ("y", "sensor", "1")
+    assert (sensor.place, sensor.kind, sensor.unit) == ("y", "sensor", "°C")
     assert sensor.deviation == pytest.approx(SENSOR, rel=0.15)
-    assert (load.place, load.kind) == ("u", "load")
+    assert (load.place, load.kind, load.unit) == ("u", "load", "%")
     assert load.deviation == pytest.approx(0.1, rel=0.7)
     assert load.correlation_time == found["tau[u]"].value
     assert found.plant_noise.rms_free is not None
