@@ -165,9 +165,7 @@ def add_kalman_filter(model: Model, noise: PlantNoise, scales: NoiseScales) -> M
             return _add_recursive_covariance(given, model, diffusion, scales)
         tangent = follow_rates(model)
         covariance = Covariance(tangent.find_noisy(_name_states(model), diffusion))
-        rates = {
-            pair: make_rate(pair, tangent, covariance, diffusion) for pair in covariance.pairs
-        }
+        rates = {pair: make_rate(pair, tangent, covariance, diffusion) for pair in covariance.pairs}
         return _add_covariance(model, covariance, rates, rates, {})
     except NoDerivativeError as error:
         raise _refuse(noise, f"the filter cannot follow the function {error}") from None

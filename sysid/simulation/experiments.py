@@ -392,9 +392,7 @@ def _read_measured_start(
     InvalidRecord
         If no output measures the state or its integral.
     """
-    measured = {
-        match_measured_state(o): c for o, c in zip(model.outputs, outputs, strict=True)
-    }
+    measured = {match_measured_state(o): c for o, c in zip(model.outputs, outputs, strict=True)}
     name = model.states[state].name
     count = max(model.memory, 1) if is_difference(model) else 1
     if name in measured:

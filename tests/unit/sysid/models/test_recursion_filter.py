@@ -138,7 +138,9 @@ def test_without_noise_of_the_sensor_predictions_start_from_measured_values() ->
             model, [record], loss=Loss(noise_model="plant"), parameters=noise, skip=2
         )
         values, _ = filtered.predict_ahead(THETA[:, :4])
-        np.testing.assert_allclose(values[0, first:], ahead.predict(THETA[:, :4])[0, first:], atol=1e-6)
+        np.testing.assert_allclose(
+            values[0, first:], ahead.predict(THETA[:, :4])[0, first:], atol=1e-6
+        )
 
 
 def test_a_load_of_a_recursion_is_an_ornstein_uhlenbeck_process() -> None:
