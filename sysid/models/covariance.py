@@ -41,7 +41,7 @@ class Tangent:
         return [name for name in names if name in noisy]
 
 
-class Covariance(NamedTuple):
+class StateCovariance(NamedTuple):
     """Entries of P for the states that noise reaches; it is symmetric."""
 
     noisy: Sequence[str]
@@ -102,7 +102,7 @@ def _add_slope(slopes: Slopes, pair: Pair, slope: Expression) -> None:
 
 
 def make_rate(
-    pair: Pair, tangent: Tangent, covariance: Covariance, diffusion: Mapping[str, Expression]
+    pair: Pair, tangent: Tangent, covariance: StateCovariance, diffusion: Mapping[str, Expression]
 ) -> Expression:
     """Make the rate of a covariance: an entry of A P + P Aᵀ + Q."""
     first, second = pair
@@ -119,7 +119,7 @@ def make_rate(
 
 
 def make_step(
-    pair: Pair, tangent: Tangent, covariance: Covariance, noise: Mapping[str, Expression]
+    pair: Pair, tangent: Tangent, covariance: StateCovariance, noise: Mapping[str, Expression]
 ) -> Expression:
     """Make the next value of a covariance: an entry of A P Aᵀ + G Q Gᵀ, P one sample before."""
     first, second = pair

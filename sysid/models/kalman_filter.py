@@ -50,8 +50,8 @@ from sysid.language.tree import (
     match_plain_state,
 )
 from sysid.models.covariance import (
-    Covariance,
     Pair,
+    StateCovariance,
     Tangent,
     follow_rates,
     follow_recursion,
@@ -164,7 +164,7 @@ def add_kalman_filter(model: Model, noise: PlantNoise, scales: NoiseScales) -> M
         if _is_recursion(model):
             return _add_recursive_covariance(given, model, diffusion, scales)
         tangent = follow_rates(model)
-        covariance = Covariance(tangent.find_noisy(_name_states(model), diffusion))
+        covariance = StateCovariance(tangent.find_noisy(_name_states(model), diffusion))
         rates = {pair: make_rate(pair, tangent, covariance, diffusion) for pair in covariance.pairs}
         return _add_covariance(model, covariance, rates, rates, {})
     except NoDerivativeError as error:
@@ -343,7 +343,7 @@ def _add_recursive_covariance(
         if isinstance(start, MeasuredInitial)
     }
     tangent = follow_recursion(model)
-    covariance = Covariance(tangent.find_noisy(_name_states(model), {**diffusion, **unknown}))
+    covariance = StateCovariance(tangent.find_noisy(_name_states(model), {**diffusion, **unknown}))
     own = set(_name_states(given))
     kept = {(name, name): ONE for name in own if name not in unknown}
     held = Tangent(
@@ -373,7 +373,7 @@ def _measure_unknown(state: str, model: Model, scales: NoiseScales) -> Expressio
 
 def _add_covariance(
     model: Model,
-    covariance: Covariance,
+    covariance: StateCovariance,
     changes: Mapping[Pair, Expression],
     steady: Mapping[Pair, Expression],
     unknown: Mapping[str, Expression],
@@ -448,7 +448,7 @@ def _is_load(state: str) -> bool:
     return state.startswith("d[")
 
 
-def _make_corrections(model: Model, covariance: Covariance) -> Iterator[Correction]:
+def _make_corrections(model: Model, covariance: StateCovariance) -> Iterator[Correction]:
     for output in model.outputs:
         seen = {
             name: differentiate(output.expression, PastValue(name, "state"))
