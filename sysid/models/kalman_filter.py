@@ -14,8 +14,8 @@ recursion noise is added to each sample of a state, as φ(k) of Eq. 16. Its fixe
     d(k) = ρ d(k-1) + √(1 - ρ²) λ·w,  ρ = exp(-h/τ);    P ← A P Aᵀ + G Q Gᵀ
 
 All deviations are relative to that of the sensor, so its variance is 1 here and has a closed form
-in the likelihood. A linear model whose states have no delays has its exact filter. Others have the
-extended one, in which delayed states count as known.
+in the likelihood. A linear model whose states have no delays, or short ones in a recursion, has its
+exact filter. Others have the extended one, in which delayed states count as known.
 
 A load enters where its input does, but without the input's delay: before or after a dead time is
 the same for a stationary process. The innovations y - ŷ are the residuals, and their sum of squares
@@ -24,7 +24,8 @@ is minimised: the filter-error method (Maine and Iliff 1981) in innovations form
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import sqrt
+from math import inf, sqrt
+from typing import Any
 
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import FILTERED, NoiseModel, PlantNoise
@@ -68,9 +69,12 @@ from sysid.models.model import (
     ModelSignal,
     Output,
 )
-from sysid.models.parameters import Parameter
+from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.rest import NoRestError, solve_rest
 from sysid.models.sections import STEADY, get_interval
+
+ParameterChanges = Mapping[str, Mapping[str, Any]]
+"""Changes of parameters by name, such as ``{"L": {"upper": 2.0}}``."""
 
 _PARAMETERS = ("load", "tau", "noise")
 _SMALLEST, _LARGEST = 1e-3, 1e3  # deviation of a load at its input over the sensor's, by spans
@@ -96,11 +100,14 @@ class NoiseScales:
         Span of each input and output.
     period, duration : float
         Sampling period and duration (s).
+    least_distance : float
+        Least distance (s) of two samples of an output.
     """
 
     spans: Mapping[str, float]
     period: float
     duration: float
+    least_distance: float
 
 
 def check_noise_changes(names: Iterable[str], requested: NoiseModel) -> None:
@@ -135,8 +142,12 @@ def list_plant_noise(model: Model) -> tuple[PlantNoise, ...]:
     return (*found, "drift") if found else ()
 
 
-def add_kalman_filter(model: Model, noise: PlantNoise, scales: NoiseScales) -> Model:
+def add_kalman_filter(
+    model: Model, noise: PlantNoise, scales: NoiseScales, changes: ParameterChanges
+) -> Model:
     """Add a Kalman filter to a model, with the parameters of its noise.
+
+    `changes` of the model's own parameters say how far lags of states reach.
 
     ``load`` adds loads: where the document names them, else at the first of those inputs that enter
     the same equations, whose loads nothing can tell apart. The parameters are ``load[u]``, its
@@ -162,7 +173,8 @@ def add_kalman_filter(model: Model, noise: PlantNoise, scales: NoiseScales) -> M
         raise _refuse(noise, "no input enters an equation, so there is no place for a load")
     try:
         if _is_recursion(model):
-            return _add_recursive_covariance(given, model, diffusion, scales)
+            intervals = _bound_parameters(given, changes)
+            return _add_recursive_covariance(given, model, diffusion, scales, intervals)
         tangent = follow_rates(model)
         covariance = StateCovariance(tangent.find_noisy(_name_states(model), diffusion))
         rates = {pair: make_rate(pair, tangent, covariance, diffusion) for pair in covariance.pairs}
@@ -182,6 +194,15 @@ def match_measured_state(output: Output) -> str | None:
 
 def _is_recursion(model: Model) -> bool:
     return model.form != "differential"
+
+
+def _bound_parameters(model: Model, changes: ParameterChanges) -> dict[str, tuple[float, float]]:
+    """Bound the changed parameters; one that is tied may have any value."""
+    own = {one.name: changes[one.name] for one in model.parameters if one.name in changes}
+    return {
+        one.name: get_interval(one) if one.tied is None else (-inf, inf)
+        for one in override_parameters(model.parameters, own)
+    }
 
 
 def _name_states(model: Model) -> list[str]:
@@ -329,14 +350,19 @@ def _add_diffusion(model: Model, scales: NoiseScales) -> tuple[Model, dict[str, 
 
 
 def _add_recursive_covariance(
-    given: Model, model: Model, diffusion: Mapping[str, Expression], scales: NoiseScales
+    given: Model,
+    model: Model,
+    diffusion: Mapping[str, Expression],
+    scales: NoiseScales,
+    intervals: Mapping[str, tuple[float, float]],
 ) -> Model:
     """Add the covariance of a recursion, whose first samples are the start of the given model.
 
     There its states keep their values. Of a state that starts at measured values each of them is
     unknown, until the sample corrects it.
     """
-    model = add_lagged_states(model)
+    step = scales.least_distance / model.solver.substeps
+    model = add_lagged_states(model, intervals, step)
     unknown = {
         state: _measure_unknown(state, model, scales)
         for state, start in zip(_name_states(given), given.initial, strict=True)

@@ -207,6 +207,46 @@ def test_noise_enters_states_that_are_read_at_the_same_sample() -> None:
     assert problem.evaluate_fitness(theta)[0] == pytest.approx(expected.fitness, rel=1e-9)
 
 
+def _write_delayed(upper: float, **fields: Any) -> dict[str, Any]:
+    parameters = {**_write()["parameters"], "L": {"lower": 0, "upper": upper}}
+    equation = "a*x(k-1) + b*x(k-1 - L/h) + g*u(k-1)"
+    return _write(equations={"x": equation}, parameters=parameters, **fields)
+
+
+def test_a_short_unknown_lag_of_a_state_has_its_exact_likelihood() -> None:
+    record, lag = _record(), 0.9  # 3.6 samples
+    theta = np.array([[0.7, B, G, lag, NOISE]])
+    moved = np.eye(6, k=-1)
+    moved[0] = [0.7, 0.0, 0.0, 0.4 * B, 0.6 * B, 0.0]
+    noise = np.diag([NOISE**2, *[0.0] * 5])
+    u = record.inputs[0].values
+    steps = [(moved, G * value * np.eye(6)[0], noise) for value in u]
+    expected = filter_outputs(
+        steps,
+        np.eye(6)[:1],
+        np.ones(1),
+        np.full(6, 0.4),
+        np.zeros((6, 6)),
+        record.outputs[0].values[:, None],
+    )
+
+    def build(upper: float, **changes: Any) -> Problem:
+        return Problem.build(
+            parse_model(_write_delayed(upper)),
+            [record],
+            loss=Loss(noise_model="plant"),
+            parameters=changes,
+        )
+
+    exact = build(1.75).evaluate_fitness(theta)[0]
+    assert exact == pytest.approx(expected.fitness, rel=1e-9)
+    assert build(20.0, L={"upper": 1.75}).evaluate_fitness(theta)[0] == exact
+    for longer in (build(2.0), build(1.75, L={"upper": 2.0})):
+        assert "x[3]" not in [state.name for state in longer.model.states]
+        assert longer.evaluate_fitness(theta)[0] == pytest.approx(exact, rel=0.1)
+        assert longer.evaluate_fitness(theta)[0] != pytest.approx(exact, rel=1e-6)
+
+
 def test_the_documents_of_recursions_name_their_places_of_noise() -> None:
     model = parse_model(_write())
     assert model.document["noise"] == {"plant": {"x": "estimate"}}
