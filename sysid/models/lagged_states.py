@@ -113,8 +113,7 @@ class _Lags:
         """Read lags from their states, as they are or `present` samples back."""
 
         def find_lag(node: Expression) -> Expression | None:
-            last = self._find_last(node) if isinstance(node, PastValue) else None
-            if last is None:
+            if not isinstance(node, PastValue) or (last := self._find_last(node)) is None:
                 return None
             total: Expression = ZERO
             for lag, share in _divide_read(node, last):
