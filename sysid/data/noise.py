@@ -27,8 +27,7 @@ class Noise:
     Attributes
     ----------
     sigma : float
-        Standard deviation of the noise, in the unit of each output. Inside the plant it is that of
-        each sample of a recursion, else per √s, in the unit of the state.
+        Standard deviation of the noise, in the unit of each output.
     seed : int
         Seed of the noise; the same seed gives the same noise.
     kind : NoiseKind
@@ -39,7 +38,8 @@ class Noise:
         χ of Eq. 19 of the paper.
     place : NoisePlace
         ``plant``: φ of Eq. 13 and 16, where the model's document says that noise enters. The
-        record is simulated again with it (`sysid.simulation.process_noise`).
+        record is simulated again with it. Then `sigma` is that of each sample of a recursion, or
+        else per √s, in the unit of the state.
     parameters : mapping of str to float
         True parameters of that simulation.
 
