@@ -241,6 +241,8 @@ def test_a_short_unknown_lag_of_a_state_has_its_exact_likelihood() -> None:
     exact = build(1.75).evaluate_fitness(theta)[0]
     assert exact == pytest.approx(expected.fitness, rel=1e-9)
     assert build(20.0, L={"upper": 1.75}).evaluate_fitness(theta)[0] == exact
+    tied = build(1.75, L={"tied": "1.2 - 0.5*g"})  # whose values its bounds do not limit
+    assert "x[3]" not in [state.name for state in tied.model.states]
     for longer in (build(2.0), build(1.75, L={"upper": 2.0})):
         assert "x[3]" not in [state.name for state in longer.model.states]
         assert longer.evaluate_fitness(theta)[0] == pytest.approx(exact, rel=0.1)
