@@ -213,37 +213,38 @@ def _write_delayed(upper: float, **fields: Any) -> dict[str, Any]:
     return _write(equations={"x": equation}, parameters=parameters, **fields)
 
 
-def test_a_short_unknown_lag_of_a_state_has_its_exact_likelihood() -> None:
-    record, lag = _record(), 0.9  # 3.6 samples
+@pytest.mark.parametrize("history", ["constant", "zero"])
+def test_a_short_unknown_lag_of_a_state_has_its_exact_likelihood(history: str) -> None:
+    record, lag = _record(), 1.65  # 6.6 samples
     theta = np.array([[0.7, B, G, lag, NOISE]])
-    moved = np.eye(6, k=-1)
-    moved[0] = [0.7, 0.0, 0.0, 0.4 * B, 0.6 * B, 0.0]
-    noise = np.diag([NOISE**2, *[0.0] * 5])
+    moved = np.eye(8, k=-1)
+    moved[0] = [0.7, *[0.0] * 5, 0.4 * B, 0.6 * B]
+    noise = np.diag([NOISE**2, *[0.0] * 7])
     u = record.inputs[0].values
-    steps = [(moved, G * value * np.eye(6)[0], noise) for value in u]
+    steps = [(moved, G * value * np.eye(8)[0], noise) for value in u]
     expected = filter_outputs(
         steps,
-        np.eye(6)[:1],
+        np.eye(8)[:1],
         np.ones(1),
-        np.full(6, 0.4),
-        np.zeros((6, 6)),
+        np.array([0.4, *[0.4 if history == "constant" else 0.0] * 7]),
+        np.zeros((8, 8)),
         record.outputs[0].values[:, None],
     )
 
     def build(upper: float, **changes: Any) -> Problem:
         return Problem.build(
-            parse_model(_write_delayed(upper)),
+            parse_model(_write_delayed(upper, solver={"history": history})),
             [record],
             loss=Loss(noise_model="plant"),
             parameters=changes,
         )
 
-    exact = build(1.75).evaluate_fitness(theta)[0]
+    exact = build(1.7).evaluate_fitness(theta)[0]
     assert exact == pytest.approx(expected.fitness, rel=1e-9)
-    assert build(20.0, L={"upper": 1.75}).evaluate_fitness(theta)[0] == exact
-    tied = build(1.75, L={"tied": "1.2 - 0.5*g"})  # whose values its bounds do not limit
+    assert build(20.0, L={"upper": 1.7}).evaluate_fitness(theta)[0] == exact
+    tied = build(1.7, L={"tied": "1.2 - 0.5*g"})  # whose values its bounds do not limit
     assert "x[3]" not in [state.name for state in tied.model.states]
-    for longer in (build(2.0), build(1.75, L={"upper": 2.0})):
+    for longer in (build(2.0), build(1.7, L={"upper": 2.0})):
         assert "x[3]" not in [state.name for state in longer.model.states]
         assert longer.evaluate_fitness(theta)[0] == pytest.approx(exact, rel=0.1)
         assert longer.evaluate_fitness(theta)[0] != pytest.approx(exact, rel=1e-6)
