@@ -378,11 +378,18 @@ def load_full_run(session: Session, store: ObjectStore, stored: StoredRun) -> Ru
         sampled = () if result.posterior is None else result.posterior.parameters
         heights |= {
             "correlation": correlation_height(len(names)) if result.correlation else 0,
+            "disturbances": _disturbances_height(result),
             "residuals": _residuals_height(result) if has_signals else 0,
             "waterfall": WATERFALL_HEIGHT if result.islands else 0,
             "posterior": posterior_height(len(sampled)) if sampled else 0,
         }
     return to_run_view(stored, result, stored.rms_unit(session), heights)
+
+
+def _disturbances_height(result: Result) -> int:
+    sources = () if result.plant_noise is None else result.plant_noise.sources
+    inside = sum(source.kind != "sensor" for source in sources)
+    return signal_figures.disturbance_height(inside) if inside else 0
 
 
 def _residuals_height(result: Result) -> int:

@@ -4,7 +4,8 @@ A result does not store the covariance of its estimates. It is computed again on
 with as many simulations as there are parameters, twice.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -30,7 +31,7 @@ from sysid.results.result import Result
 if TYPE_CHECKING:
     from sysid.identification.fit_problems import FitRecords
     from sysid.simulation.problem import Problem
-    from sysid.uncertainty.output_bands import OutputBands
+    from sysid.uncertainty.output_bands import OutputBands, ParameterSpread
 
 MAX_WORK = 20_000_000  # of `measure_work`: about five seconds
 _CACHE_SIZE = 4  # runs: a zoom reads the same bands repeatedly
@@ -83,12 +84,32 @@ def _compute_bands(
     session: Session, store: ObjectStore, stored: StoredRun
 ) -> "tuple[tuple[OutputBands, ...], ...]":
     # These import the compiler, which most requests never need.
+    from sysid.results.bands import estimate_noise
+    from sysid.uncertainty.output_bands import compute_output_bands
+
+    assert stored.result is not None
+    agreement = stored.result.agreement.estimation
+    with build_spread_fit(session, store, stored, "bands") as (problem, theta, spread):
+        noise = estimate_noise(agreement, spread.noise_degrees)
+        return compute_output_bands(problem, theta, spread, noise)
+
+
+@contextmanager
+def build_spread_fit(
+    session: Session, store: ObjectStore, stored: StoredRun, what: str
+) -> "Iterator[tuple[Problem, FloatArray, ParameterSpread]]":
+    """Build the problem of a run on its whole records, its estimate, and how far that may be off.
+
+    The block that computes `what` holds a place among simulations.
+
+    Raises
+    ------
+    Conflict
+        If the run has no standard errors, its records are gone, or the work is too much.
+    """
+    # These import the compiler, which most requests never need.
     from sysid.residuals.series import make_whitening
-    from sysid.results.bands import (
-        compute_fit_bands,
-        estimate_noise,
-        list_whole_records,
-    )
+    from sysid.results.bands import build_fit, list_whole_records
     from sysid.uncertainty.analysis import analyse_estimate
     from sysid.uncertainty.output_bands import ParameterSpread
 
@@ -98,41 +119,37 @@ def _compute_bands(
         records = stored.read_fit_records(session, store)
         problem = stored.problem(session, store)
         release_connection(session)
-        _check_work(run_id, problem)
+        _check_work(run_id, problem, what)
         theta = read_estimate(problem, stored)
-        noise_degrees = float(problem.n_scored - theta.size)
         times = result.correlation_times
         with simulation_places.hold(find_project(session)):
             whitening = make_whitening(problem, times) if any(times.values()) else None
             uncertainty = analyse_estimate(problem, theta, whitening=whitening).uncertainty
             if uncertainty is None:
-                raise Conflict(f"run {run_id} has no standard errors, so there are no bands")
-            return compute_fit_bands(
-                stored.model,
-                list_whole_records(records.estimation, _list_later_parts(records)),
-                stored.estimates,
-                _read_ties(stored.body),
-                ParameterSpread(
-                    problem.free_names,
-                    uncertainty.covariance,
-                    uncertainty.degrees,
-                    noise_degrees,
-                    _get_samples(result),
-                ),
-                estimate_noise(result.agreement.estimation, noise_degrees),
-                stored.body["prediction"],
-                noise_model=result.noise_model,
+                raise Conflict(f"run {run_id} has no standard errors, so there are no {what}")
+            spread = ParameterSpread(
+                problem.free_names,
+                uncertainty.covariance,
+                uncertainty.degrees,
+                float(problem.n_scored - theta.size),
+                _get_samples(result),
+            )
+            whole = list_whole_records(records.estimation, _list_later_parts(records))
+            estimates, ties = stored.estimates, _read_ties(stored.body)
+            yield (
+                *build_fit(stored.model, whole, estimates, ties, stored.body["prediction"], result),
+                spread,
             )
     except (SysidError, NotFound, InvalidRequest, RowNotFound, ObjectMissing) as error:
-        raise Conflict(f"the bands of run {run_id} cannot be computed: {error}") from error
+        raise Conflict(f"the {what} of run {run_id} cannot be computed: {error}") from error
 
 
-def _check_work(run_id: str, problem: "Problem") -> None:
+def _check_work(run_id: str, problem: "Problem", what: str) -> None:
     work = measure_work(problem)
     if work > MAX_WORK:
         raise Conflict(
-            f"the bands of run {run_id} are too much work. Steps × parameters is {work:.3g}; "
-            f"need at most {MAX_WORK:.3g}. Use `compute_bands` of the Python library"
+            f"the {what} of run {run_id} are too much work. Steps × parameters is {work:.3g}; "
+            f"need at most {MAX_WORK:.3g}. Use `compute_{what}` of the Python library"
         )
 
 

@@ -10,9 +10,10 @@ from sysid.core.units import is_blank_unit
 from sysid.kernels.signals.past_reads import is_difference
 from sysid.models.kalman_filter import is_noise_parameter
 from sysid.results.parts import NoiseSource, PlantNoise
-from sysid.simulation.data_bounds import find_signal_units
+from sysid.simulation.data_bounds import list_units
 from sysid.simulation.free_run import simulate_free_run
 from sysid.simulation.problem import Problem, compute_metrics
+from sysid.simulation.steps_ahead import measure_prediction_errors
 
 
 def describe_plant_noise(problem: Problem, theta: FloatArray, rms: float) -> PlantNoise | None:
@@ -34,6 +35,7 @@ def describe_plant_noise(problem: Problem, theta: FloatArray, rms: float) -> Pla
         tuple(_list_sources(problem, values, sensor)),
         metrics.rms if is_finite else None,
         metrics.fit_percent if is_finite else None,
+        measure_prediction_errors(problem, theta),
     )
 
 
@@ -41,10 +43,7 @@ def _list_sources(
     problem: Problem, values: Mapping[str, float], sensor: float
 ) -> Iterator[NoiseSource]:
     """List the sensors, and the places of noise by the parameters of the filter."""
-    units = {one.name: one.unit for one in (*problem.model.states, *problem.model.inputs)}
-    units |= {output.name: output.unit for output in problem.model.outputs}
-    recorded = find_signal_units(problem.records)
-    units |= {name: unit for name, unit in recorded.items() if is_blank_unit(units.get(name))}
+    units = list_units(problem.model, problem.records)
     for output in problem.model.outputs:
         size = sensor / problem.output_weights[output.name]
         yield NoiseSource(output.name, "sensor", size, units[output.name], None)

@@ -61,6 +61,16 @@ class StateCovariance(NamedTuple):
         return PastValue(self.name(pair), "state")
 
 
+def is_covariance(state: str) -> bool:
+    """Whether a state is an entry of P."""
+    return state.startswith("P[")
+
+
+def list_noisy(states: Sequence[str]) -> list[str]:
+    """List the states of a filter whose variances are among its states."""
+    return [name for name in states if StateCovariance((name,)).name((name, name)) in states]
+
+
 def follow_rates(model: Model) -> Tangent:
     """Differentiate the rates of a differential model by its present states."""
     pairs = _list_equations(model)

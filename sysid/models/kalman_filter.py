@@ -24,8 +24,9 @@ is minimised: the filter-error method (Maine and Iliff 1981) in innovations form
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from math import inf, sqrt
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import FILTERED, NoiseModel, PlantNoise
@@ -52,10 +53,13 @@ from sysid.language.tree import (
 )
 from sysid.models.covariance import (
     Pair,
+    Slopes,
     StateCovariance,
     Tangent,
     follow_rates,
     follow_recursion,
+    is_covariance,
+    list_noisy,
     make_rate,
     make_step,
 )
@@ -90,6 +94,13 @@ def is_noise_parameter(name: str) -> bool:
     return name.partition("[")[0] in _PARAMETERS and name.endswith("]")
 
 
+class NoisePlace(NamedTuple):
+    """Where noise acts inside the plant: as a load there, or as diffusion of a state."""
+
+    place: str
+    kind: Literal["load", "plant"]
+
+
 @dataclass(frozen=True, slots=True)
 class NoiseScales:
     """Sizes in the data that bound the noise.
@@ -108,6 +119,80 @@ class NoiseScales:
     period: float
     duration: float
     least_distance: float
+
+
+class FilterReadings(NamedTuple):
+    """What a smoother reads of a filter at each time, as outputs of the model.
+
+    Attributes
+    ----------
+    states : tuple of str
+        The n states that noise reaches.
+    places : tuple of (str, NoisePlace)
+        The noise among them: its state, and where it acts.
+    outputs : tuple of Output
+        n states; n² covariances, by rows; n² slopes ∂f/∂x, by rows, in a recursion those of the
+        step that ends there; then for each output of the model its n slopes ∂h/∂x.
+    """
+
+    states: tuple[str, ...]
+    places: tuple[tuple[str, NoisePlace], ...]
+    outputs: tuple[Output, ...]
+
+
+def list_filter_readings(model: Model) -> FilterReadings:
+    """List what a smoother reads of a model with a filter."""
+    noisy = list_noisy(_name_states(model))
+    covariance = StateCovariance(noisy)
+    places = [
+        (name, NoisePlace(name[2:-1] if _is_load(name) else name, kind))
+        for name in noisy
+        for kind in [_find_kind(name, model)]
+        if kind is not None
+    ]
+    slopes = _follow_filter(model, noisy)
+    trees: list[Expression] = [PastValue(name, "state") for name in noisy]
+    trees += [covariance.read(pair) for pair in product(noisy, noisy)]
+    trees += [slopes.get(pair, ZERO) for pair in product(noisy, noisy)]
+    trees += [
+        differentiate(one.expression, PastValue(name, "state"))
+        for one, name in product(model.outputs, noisy)
+    ]
+    outputs = tuple(Output(f"filter {i}", tree) for i, tree in enumerate(trees))
+    return FilterReadings(tuple(noisy), tuple(places), outputs)
+
+
+def _follow_filter(model: Model, noisy: Sequence[str]) -> Slopes:
+    """Differentiate the equations of a filter's states, those of its covariance left out.
+
+    In the first samples of a recursion, measured states do not follow those before.
+    """
+    rows = [i for i, name in enumerate(_name_states(model)) if not is_covariance(name)]
+    plain = replace(
+        model,
+        states=tuple(model.states[i] for i in rows),
+        equations=tuple(model.equations[i] for i in rows),
+        order=tuple(i for i in model.order if i in rows),
+    )
+    if not _is_recursion(model):
+        return follow_rates(plain).states
+    measured = {
+        state
+        for state, start in zip(_name_states(model), model.initial, strict=True)
+        if isinstance(start, MeasuredInitial)
+    }
+    return {
+        pair: hold_first_samples(model, ZERO, slope) if pair[0] in measured else slope
+        for pair, slope in follow_recursion(plain).states.items()
+    }
+
+
+def _find_kind(state: str, model: Model) -> Literal["load", "plant"] | None:
+    """Find the kind of noise that drives a state; None if it only follows others."""
+    if _is_load(state):
+        return "load"
+    names = {parameter.name for parameter in model.parameters}
+    return "plant" if f"noise[{state}]" in names else None
 
 
 def check_noise_changes(names: Iterable[str], requested: NoiseModel) -> None:

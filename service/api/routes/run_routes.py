@@ -23,6 +23,7 @@ from service.repositories.run_rows import RunRepository
 from service.runs import (
     bands,
     comparison,
+    disturbances,
     exports,
     fitted,
     profiles,
@@ -35,6 +36,7 @@ from service.runs.run_schemas import (
     BandsOut,
     CompareIn,
     ComparisonOut,
+    DisturbancesOut,
     ExportedModelOut,
     FreeRunIn,
     FreeRunOut,
@@ -110,6 +112,14 @@ def read_bands(
 ) -> BandsOut:
     """Read the 95 % confidence and prediction bands of the outputs, computed from the estimates."""
     return bands.build_bands(session, parts.store, run_id, max_points)
+
+
+@router.get("/{run_id}/disturbances")
+def read_disturbances(
+    run_id: str, session: ReadSession, parts: PartsDep, max_points: MaxPoints = 1000
+) -> DisturbancesOut:
+    """Read the estimated disturbances with their 95 % bands, if noise acts inside the plant."""
+    return disturbances.build_disturbances(session, parts.store, run_id, max_points)
 
 
 @router.get("/{run_id}/residuals")
