@@ -86,7 +86,7 @@ _LONGEST = 10.0  # of the record: correlation time of a load
 _SPAN = 4.0  # of an output in its deviations
 _LEAST_SHARE, _MOST_SHARE = 1e-2, 1e4  # of the sensor's deviation: diffusion over the record
 _GROWTH = 1.5  # power of the samples with which noise of each grows when it is summed twice
-_UNKNOWN = 1e8  # variance of a measured start over the sensor's: 1e-8 of it is kept
+_UNKNOWN = 1e6  # variance of a measured start over the sensor's: rounding grows with its square
 
 
 def is_noise_parameter(name: str) -> bool:

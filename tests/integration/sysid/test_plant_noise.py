@@ -265,6 +265,13 @@ def test_noise_in_the_papers_recursion_is_told_from_that_of_its_sensor(tmp_path:
     found.save(tmp_path / "found.json")
     assert Identification.load(tmp_path / "found.json") == found
     assert "noise[x]" not in export_model(load_model("duffing-eq16"), found, "json")
+    assert "observer" not in export_model(load_model("duffing-eq16"), found, "c")
+    errors = [one.rms for one in found.plant_noise.prediction_errors]
+    assert np.all(np.diff(errors) > 0)
+    (state,) = found.compute_disturbances()
+    true = make_oscillator(1e-4, 0.0).outputs[0].values  # the noises of other draws are the same
+    inside = (state.band[:, 0] <= true) & (true <= state.band[:, 1])
+    assert np.mean(inside) > 0.8
     (band,) = found.compute_bands()
     np.testing.assert_allclose(band.simulated, found.simulated[0][0])
 
