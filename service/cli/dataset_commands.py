@@ -12,9 +12,11 @@ from service.cli.common import (
     DOCUMENT_HELP,
     LISTED_ENTRIES,
     STANDARD_INPUT,
+    AsJson,
     FieldOrigins,
     Force,
     Limit,
+    Quiet,
     SampleTime,
     Segments,
     check_file,
@@ -38,6 +40,7 @@ from service.cli.common import (
     report_faults,
     server_command,
     show_examples,
+    split_names,
     upload_origins,
 )
 from service.cli.item_commands import (
@@ -157,6 +160,40 @@ def _print_whole_dataset(stored: Mapping[str, Any]) -> None:
         for channel in stored["channels"]
     ]
     print_table(("channel", "unit", ">samples", ">missing", "hold"), rows, empty="none")
+
+
+@app.command(
+    "check",
+    epilog=show_examples(
+        "lagid dataset check recording.csv",
+        "lagid dataset check logger.txt --sample-time 0.1 --json",
+    ),
+)
+def check_dataset(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help=DATA_HELP)],
+    segments: Segments = None,
+    sample_time: SampleTime = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Check what happened to a recording, without a model and without a server.
+
+    Gaps, stamps, repeated and coarse values, limits, means, resampled logs, changes of a unit.
+    """
+    from service.cli.identify_command import FileOptions, read_input_file
+    from sysid.core.value_documents import encode
+    from sysid.inspection.inspect import check_recording
+
+    recording = read_input_file(file, FileOptions(sample_time, tuple(split_names(segments))))
+    findings = check_recording(recording)
+    if as_json:
+        print_json([encode(finding) for finding in findings])
+        return
+    print_line(str(recording))
+    for finding in findings:
+        print_line(f"{finding.explanation}: {finding.sentences}")
+    if not findings:
+        print_line("nothing was found")
 
 
 @app.command("show", epilog=show_examples("lagid dataset show recording"))

@@ -179,7 +179,7 @@ def identify(
     _refuse_same_file(data, validation)
     reading = FileOptions(sample_time, tuple(split_names(segments)))
     recording = read_input_file(data, reading)
-    body, loaded = check_body(unchecked, max(1, len(recording.segments)))
+    body, loaded = check_body(unchecked, _count_most_experiments(recording))
     with _report_core_faults():
         read = _extract_records(recording, Path(name_file(data)), loaded, body)
         validation_records: Sequence[Record] = ()
@@ -189,7 +189,7 @@ def identify(
             ).records
     from sysid.core.jit import announce_compilation, read_clock
 
-    printed = [*read.notes]
+    printed = [*read.notes, *_print_events(read.records)]
     begun = read_clock()
     with _report_core_faults(), announce_compilation(err.print):
         result = _run_identification(
@@ -411,6 +411,20 @@ def print_result(
     _print_posterior(result.posterior)
     _print_notes(warning for warning in result.warnings if warning not in printed)
     _print_notes(list_untold_reasons(result.parameters, result.findings))
+
+
+def _count_most_experiments(recording: "Recording") -> int:
+    """Count the experiments of a recording if all channels were inputs."""
+    from sysid.data.outages import cut_segments, find_cuts
+
+    return sum(max(len(find_cuts(one, one.names)), 1) for one in cut_segments(recording))
+
+
+def _print_events(records: "Sequence[Record]") -> list[str]:
+    """Print what happened to the recordings, and return it."""
+    events = list(dict.fromkeys(one.sentences for record in records for one in record.findings))
+    _print_notes(events)
+    return events
 
 
 def _print_notes(warnings: Iterable[str]) -> None:

@@ -15,8 +15,10 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import DatasetNotFound, TooLarge
 from service.core.process import temporary_files
+from service.core.process.concurrency import ReaderPlaces
 from service.core.settings import Settings
 from service.datasets.dataset_schemas import (
+    DatasetCheckOut,
     DatasetOut,
     DatasetPage,
     DeriveIn,
@@ -26,6 +28,7 @@ from service.datasets.dataset_schemas import (
     SignalsOut,
     TombstoneOut,
 )
+from service.datasets.large_derivation import derive
 from service.datasets.stored_recordings import load_recording
 from service.formats.file_kinds import SUFFIXES, detect_kind
 from service.formats.limits import DEFAULT_LIMITS, UploadLimits
@@ -46,8 +49,11 @@ from service.storage.sessions import Database, release_connection
 from service.storage.storage_errors import ObjectDamaged, ObjectMissing, RowNotFound
 from service.storage.tables import Dataset
 from sysid.core.errors import suggest_name
+from sysid.core.value_documents import encode
+from sysid.data.outages import list_unseen
 from sysid.data.records import Channel, Recording
 from sysid.figures.decimate import decimate
+from sysid.inspection.inspect import inspect_recording
 from sysid.models.unit_checks import list_unknown_unit_warnings
 
 
@@ -157,7 +163,7 @@ def add_upload(
 
 
 def derive_dataset(
-    database: Database, store: ObjectStore, parent_id: str, body: DeriveIn
+    database: Database, store: ObjectStore, readers: ReaderPlaces, parent_id: str, body: DeriveIn
 ) -> StoredDataset:
     """Derive a dataset from another by steps; the same steps again return the same dataset.
 
@@ -165,8 +171,10 @@ def derive_dataset(
     ------
     DatasetNotFound
         If no dataset has that identifier or name, or several share the name.
-    InvalidRecord, InvalidSettings
-        If a step is not possible.
+    InvalidRecord, InvalidSettings, InvalidRequest
+        If a step is not possible, or needs too much memory or time.
+    ServiceBusy
+        If it is long, and no place became free in time.
     """
     with database.read_session() as session:
         parent = resolve_dataset(session, parent_id)
@@ -175,9 +183,8 @@ def derive_dataset(
         existing = find_existing(session, store, _hash_derivation(parent, body))
     if existing is not None:
         return StoredDataset(existing, is_new=False)
-    from sysid.data.derivations import apply_steps  # brings SciPy's signal processing
-
-    recording, subtracted = apply_steps(load_recording(store, parent.sha256), body.steps)
+    project = database.owner.project_id
+    recording, subtracted = derive(store, parent, body.steps, readers, project)
     steps = ", ".join(next(iter(step), "?") for step in body.steps)
     return add_recording(
         database,
@@ -188,7 +195,7 @@ def derive_dataset(
         key=_hash_derivation(parent, body),
         details={
             "steps": body.steps,
-            "subtracted": [trend._asdict() for trend in subtracted],
+            "subtracted": subtracted,
             "warnings": [],
             "known_before": _measure_history(recording),
         },
@@ -251,6 +258,7 @@ def describe_recording(
             **details,
             "started_at": None if start is None else start.isoformat(),
             "warnings": [*details["warnings"], *list_unknown_unit_warnings(recording.channels)],
+            "outages": list_unseen(recording),
             "segments": [
                 {"start": s.start, "stop": s.stop, "origin": s.origin, "labels": dict(s.labels)}
                 for s in recording.segments
@@ -311,6 +319,13 @@ def read_signals(
         channels=[to_series(channel, max_points) for channel in channels],
         history=[to_series(channel, max_points) for channel in histories],
     )
+
+
+def check_dataset(session: Session, store: ObjectStore, dataset_id: str) -> DatasetCheckOut:
+    """Check what happened to the recording of a dataset."""
+    row = DatasetRepository(session).get(dataset_id)
+    findings = inspect_recording(load_recording(store, row.sha256))
+    return DatasetCheckOut(id=row.id, findings=[encode(one) for one in findings])
 
 
 def to_series(channel: Channel, max_points: int) -> SeriesOut:

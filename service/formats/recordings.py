@@ -15,6 +15,7 @@ from sysid.core.errors import UnreadableFile
 from sysid.data.foreign_tables import describe_value, is_labelled
 from sysid.data.records import Recording
 from sysid.data.table_rules import tell_notes
+from sysid.inspection.inspect import check_recording
 
 
 @runtime_checkable
@@ -33,7 +34,8 @@ def read_recording(
 ) -> Recording:
     r"""Read a recording: text of columns, Excel, Parquet, NumPy, MATLAB or MCAP.
 
-    Everything that is guessed is told as a warning, `ReadingNote`. Times are in s from the start;
+    Everything that is guessed is told as a warning, `ReadingNote`. So is what happened to the
+    recording, as `check_recording` finds it. Times are in s from the start;
     the clock of the file is `Recording.started_at`.
 
     Parameters
@@ -63,7 +65,7 @@ def read_recording(
     (('valve', 'flow'), 'l/min', 0.2)
     """
     recording, notes = read_with_notes(source, sample_time=sample_time, segments=segments)
-    tell_notes(notes)
+    tell_notes((*notes, *(one.sentences for one in check_recording(recording))))
     return recording
 
 

@@ -15,12 +15,12 @@ from sqlalchemy.orm import Session
 from service.core.bodies.user_documents import to_finite
 from service.core.computed import ComputedValues
 from service.core.errors import Conflict, InvalidRequest, NotFound
-from service.core.process.concurrency import simulation_places
 from service.jobs.stored_run import StoredRun, load_estimated_run
+from service.queue.daily_limit import compute_on_request
 from service.runs.profiles import measure_work, read_estimate
 from service.runs.run_schemas import BandExperimentOut, BandOut, BandsOut
 from service.storage.objects import ObjectStore
-from service.storage.sessions import find_project, release_connection
+from service.storage.sessions import find_database, release_connection
 from service.storage.storage_errors import ObjectMissing, RowNotFound
 from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
@@ -47,6 +47,8 @@ def load_bands(
     ------
     Conflict
         If the run has no standard errors, its records are gone, or the work is too much.
+    BudgetExceeded
+        If the project has used up its evaluations of a day.
     """
     return _computed_bands.get(
         stored.run.id,
@@ -65,6 +67,8 @@ def build_bands(session: Session, store: ObjectStore, run_id: str, max_points: i
         If there is no such run.
     Conflict
         If it has no estimates, or no bands.
+    BudgetExceeded
+        As `load_bands`.
     """
     stored = load_estimated_run(session, run_id, "compute bands from")
     bands = load_bands(session, store, stored)
@@ -122,9 +126,11 @@ def build_spread_fit(
         _check_work(run_id, problem, what)
         theta = read_estimate(problem, stored)
         times = result.correlation_times
-        with simulation_places.hold(find_project(session)):
+        with compute_on_request(find_database(session)) as computation:
             whitening = make_whitening(problem, times) if any(times.values()) else None
-            uncertainty = analyse_estimate(problem, theta, whitening=whitening).uncertainty
+            analysis = analyse_estimate(problem, theta, whitening=whitening)
+            computation.evaluations = 2 * analysis.evaluations  # the bands take as many
+            uncertainty = analysis.uncertainty
             if uncertainty is None:
                 raise Conflict(f"run {run_id} has no standard errors, so there are no {what}")
             spread = ParameterSpread(

@@ -36,6 +36,7 @@ from service.api.routes.item_queries import (
 from service.core.root_path import to_address
 from service.datasets import datasets, simulated
 from service.datasets.dataset_schemas import (
+    DatasetCheckOut,
     DatasetOut,
     DatasetPage,
     DeriveIn,
@@ -98,7 +99,7 @@ async def add_dataset(
     project, settings = parts.database.owner.project_id, parts.settings
     async with (
         receive_upload(request, settings, parts.upload_places, project) as upload,
-        parts.reader_places.hold_awaiting(project),
+        parts.readers.places.hold_awaiting(project),
     ):
         stored = await run_in_threadpool(
             datasets.add_upload,
@@ -111,7 +112,7 @@ async def add_dataset(
             segments=[column.strip() for column in (segments or "").split(",") if column.strip()],
             sample_time=sample_time,
             limits=UploadLimits(
-                file_bytes=settings.max_upload_bytes, memory_bytes=settings.reader_memory_bytes
+                file_bytes=settings.max_upload_bytes, memory_bytes=parts.readers.memory_bytes
             ),
         )
     return _dataset_response(stored, response, name)
@@ -121,7 +122,9 @@ async def add_dataset(
 def simulate_dataset(body: SimulateIn, parts: PartsDep, response: Response) -> DatasetOut:
     """Simulate a dataset from a model, its true parameters, inputs and noise."""
     return _dataset_response(
-        simulated.simulate_dataset(parts.database, parts.store, body), response, body.name
+        simulated.simulate_dataset(parts.database, parts.store, parts.readers, body),
+        response,
+        body.name,
     )
 
 
@@ -130,7 +133,7 @@ def derive_dataset(
     dataset_id: str, body: DeriveIn, parts: PartsDep, response: Response
 ) -> DatasetOut:
     """Derive a dataset from another, by its id or name: add noise, resample, trim, select etc."""
-    stored = datasets.derive_dataset(parts.database, parts.store, dataset_id, body)
+    stored = datasets.derive_dataset(parts.database, parts.store, parts.readers, dataset_id, body)
     return _dataset_response(stored, response, body.name)
 
 
@@ -177,6 +180,12 @@ def read_signals(
 ) -> SignalsOut:
     """Read the samples, reduced so that extremes stay visible."""
     return datasets.read_signals(session, parts.store, dataset_id, max_points)
+
+
+@router.get("/datasets/{dataset_id}/check")
+def check_dataset(dataset_id: str, session: ReadSession, parts: PartsDep) -> DatasetCheckOut:
+    """Check what happened to the recording, without a model: gaps, stamps, values, limits."""
+    return datasets.check_dataset(session, parts.store, dataset_id)
 
 
 @router.get("/datasets/{dataset_id}/lineage")

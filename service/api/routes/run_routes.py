@@ -168,7 +168,9 @@ def simulate_run(
     run_id: str, body: RunSimulationIn, parts: PartsDep, max_points: MaxPoints = 1000
 ) -> RunSimulationOut:
     """Simulate the identified model on new inputs or under P, PI or PID control."""
-    return run_simulation.simulate_run(parts.database, parts.store, run_id, body, max_points)
+    return run_simulation.simulate_run(
+        parts.database, parts.store, parts.readers, run_id, body, max_points
+    )
 
 
 @router.post("/{run_id}:validate")

@@ -23,8 +23,8 @@ from service.formats.tabular.time_columns import (
     read_stamp_times,
 )
 from sysid.core.errors import Advice, UnreadableFile
-from sysid.core.types import FloatArray, IntArray
-from sysid.data.records import Channel, Recording, Segment, measure_sampling
+from sysid.core.types import BoolArray, FloatArray, IntArray
+from sysid.data.records import Channel, Recording, Segment
 from sysid.data.table_rules import (
     NO_NAMES,
     TimeAxis,
@@ -32,6 +32,7 @@ from sysid.data.table_rules import (
     is_index_name,
     read_number_times,
 )
+from sysid.inspection.row_order import repair_order
 
 SegmentLabels = Mapping[str, float | str]
 
@@ -84,11 +85,10 @@ def build_recording(table: Table, notes: list[str]) -> Recording:
     labels = [column.name for column in table.columns if column.role == "label"]
     starts = _find_segment_starts(table, labels)
     clock = _build_times(table, starts, notes)
-    times, spans = clock.seconds, tuple[Segment, ...]()
-    if labels:
-        times, spans = _build_segments(table, labels, times, starts, notes)
-    else:
-        _report_irregular_sampling(times, notes)
+    if not labels and table.sample_time is None:
+        table, clock, starts = _repair_order(table, clock, notes)
+    _check_order(clock.seconds, starts, table, notes)
+    times, spans = _build_segments(table, labels, clock.seconds, starts, notes)
     channels, empty = [], []
     for column, values in zip(table.columns, table.values, strict=True):
         if column.role != "value":
@@ -99,7 +99,6 @@ def build_recording(table: Table, notes: list[str]) -> Recording:
             continue
         if column.kind == "flag":
             notes.append(f"channel {column.name!r}: true and false were read as 1 and 0")
-        _report_missing_values(column.name, numbers, table, notes)
         channels.append(Channel(column.name, times, numbers, column.unit or "1"))
     if not channels:
         raise UnreadableFile("every value is missing; leave the column out", column=empty[0])
@@ -193,8 +192,6 @@ def _build_times(table: Table, starts: IntArray, notes: list[str]) -> TimeAxis:
         return TimeAxis(np.concatenate(counts) * sample_time, start)
     assert time is not None  # checked with the layout
     assert clock is not None
-    _check_increasing(clock.seconds, starts, table, time)
-    _report_repeated_times(clock.seconds, starts, notes)
     return clock
 
 
@@ -220,6 +217,12 @@ def _read_times(table: Table, time: TableColumn, tell: bool, notes: list[str]) -
 def _build_segments(
     table: Table, labels: Sequence[str], times: FloatArray, starts: IntArray, notes: list[str]
 ) -> tuple[FloatArray, tuple[Segment, ...]]:
+    if not labels:
+        return (
+            concatenate_segments(times, starts, [{}] * starts.size)
+            if starts.size > 1
+            else (times, ())
+        )
     sizes = np.diff(np.append(starts, times.size))
     singles = int(np.count_nonzero(sizes == 1))
     if starts.size > 1 and 2 * singles > starts.size:
@@ -259,6 +262,40 @@ def _parse_labels(column: ColumnValues) -> list[float | str]:
     return list(numbers) if np.isfinite(numbers).all() else list(texts)
 
 
+def _repair_order(
+    table: Table, clock: TimeAxis, notes: list[str]
+) -> tuple[Table, TimeAxis, IntArray]:
+    """Repair the order of rows, and tell how; return where each measurement begins, too."""
+
+    def are_equal(rows: IntArray) -> BoolArray:
+        same = [_are_same(values[rows], values[rows - 1]) for values in table.values]
+        return np.asarray(np.all(same, axis=0))
+
+    order = repair_order(clock.seconds, are_equal)
+    if order is None:
+        return table, clock, np.zeros(1, dtype=np.int64)
+    notes += (one.sentences for one in order.findings)
+    rows = order.rows
+    values = tuple(column[rows] for column in table.values)
+    return (
+        replace(table, values=values, rows=table.rows[rows]),
+        clock._replace(seconds=clock.seconds[rows]),
+        order.starts,
+    )
+
+
+def _are_same(values: ColumnValues, others: ColumnValues) -> BoolArray:
+    return np.asarray((values == others) | ((values != values) & (others != others)))
+
+
+def _check_order(times: FloatArray, starts: IntArray, table: Table, notes: list[str]) -> None:
+    """Refuse times of a file that do not increase inside a segment, and tell those that repeat."""
+    time = next((column for column in table.columns if column.role == "time"), None)
+    if time is not None and table.sample_time is None:
+        _check_increasing(times, starts, table, time)
+        _report_repeated_times(times, starts, notes)
+
+
 def _check_increasing(times: FloatArray, starts: IntArray, table: Table, time: TableColumn) -> None:
     """Refuse times that do not increase inside a segment."""
     is_stamp = not holds_numbers(time)
@@ -294,24 +331,3 @@ def _report_repeated_times(times: FloatArray, starts: IntArray, notes: list[str]
     shared[starts[1:] - 1] = False
     if count := int(np.count_nonzero(shared)):
         notes.append(f"{count} samples have the same time as the previous sample of their segment")
-
-
-def _report_irregular_sampling(times: FloatArray, notes: list[str]) -> None:
-    sampling = measure_sampling(times)
-    if sampling.samples > 1 and not sampling.is_regular:
-        gaps = np.diff(times)
-        notes.append(
-            f"sampling is irregular: {gaps.min():.4g} to {gaps.max():.4g} s between samples, "
-            f"median {sampling.period:.4g} s. Each sample is used at its own time."
-        )
-
-
-def _report_missing_values(name: str, values: FloatArray, table: Table, notes: list[str]) -> None:
-    missing = np.flatnonzero(np.isnan(values))
-    if missing.size == 0:
-        return
-    notes.append(
-        f"channel {name!r}: {missing.size} of {values.size} values are missing (empty or NaN), the "
-        f"first in row {table.rows[missing[0]]}. An output is not scored at missing values. "
-        "An input with missing values cannot be used."
-    )
