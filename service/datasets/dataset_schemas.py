@@ -10,7 +10,7 @@ from service.core.bodies.derived_bodies import take_setting
 from service.core.bodies.value_schemas import describe_value
 from service.core.bodies.wire import Answer, Body, DescribedBy, Labels, Page, Seed
 from sysid.core.findings import Finding
-from sysid.data.noise import Noise
+from sysid.data.noise import Noise, NoisePlace
 from sysid.data.records import Hold
 
 MAX_SIMULATED_SAMPLES = 10_000_000
@@ -85,6 +85,19 @@ class NoiseIn(Body):
 
     sigma: float = take_setting(Noise, "sigma")
     seed: Seed = take_setting(Noise, "seed")
+
+
+class PlacedNoiseIn(NoiseIn):
+    """Noise added before fitting: to the measured outputs, or inside the plant.
+
+    For noise inside the plant the records are simulated again, from their inputs and true
+    `parameters`. It enters where the model's document says (`noise: {plant: …}`).
+    """
+
+    place: NoisePlace = take_setting(Noise, "place")
+    parameters: dict[str, float] = Field(
+        default={}, description="true values of the simulation with noise inside the plant, by name"
+    )
 
 
 class SimulateIn(Body):
