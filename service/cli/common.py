@@ -116,6 +116,14 @@ Segments = Annotated[
 SampleTime = Annotated[
     float | None, typer.Option(help="Sampling period in s, for a file without a time column.")
 ]
+Columns = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME,…",
+        help="Names of the columns of a file without a header: t,u,,y. A column with an empty "
+        "name is left out.",
+    ),
+]
 DATA_HELP = "Recording: text (CSV), Excel, Parquet, NumPy, MATLAB or MCAP; - for standard input."
 AsJson = Annotated[
     bool,
@@ -542,7 +550,10 @@ def format_decimals(value: float | None) -> str | None:
 
 
 INVALID_STATUS = 422
-UPLOAD_OPTIONS = {"?name": "--name", "?segments": "--segments", "?sample_time": "--sample-time"}
+UPLOAD_OPTIONS = {
+    f"?{name}": f"--{name.replace('_', '-')}"
+    for name in ("name", "segments", "sample_time", "columns")
+}
 POINTER_PATTERN = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
 """Pointers in a message: to a field of that name elsewhere, or to a fault in an axis value."""
 

@@ -12,6 +12,7 @@ from service.cli.common import (
     DOCUMENT_HELP,
     LISTED_ENTRIES,
     STANDARD_INPUT,
+    Columns,
     FieldOrigins,
     Force,
     Limit,
@@ -130,6 +131,7 @@ def add_datasets(
     ] = None,
     segments: Segments = None,
     sample_time: SampleTime = None,
+    columns: Columns = None,
     as_json: bool = False,
 ) -> None:
     """Store recordings."""
@@ -142,7 +144,9 @@ def add_datasets(
         source = read_file(file) if file == STANDARD_INPUT else file
         with report_faults(upload_origins(file)):
             stored.append(
-                client.add_dataset(source, name, segments=segments, sample_time=sample_time)
+                client.add_dataset(
+                    source, name, segments=segments, sample_time=sample_time, columns=columns
+                )
             )
         if not as_json:
             _print_dataset(stored[-1])

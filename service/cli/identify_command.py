@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import isfinite
 from pathlib import Path
 from shlex import quote
@@ -18,6 +18,7 @@ from service.cli.common import (
     OUTPUT_PANEL,
     STANDARD_INPUT,
     AsJson,
+    Columns,
     FieldOrigins,
     Force,
     ModelName,
@@ -39,7 +40,6 @@ from service.cli.common import (
     print_table,
     protect_file,
     read_file,
-    split_names,
     split_setting_path,
     upload_origins,
     write_file,
@@ -58,6 +58,7 @@ from sysid.core.settings import NOISE_MODELS
 from sysid.core.text import plain_unit
 
 if TYPE_CHECKING:
+    from service.formats.read_options import ReadOptions
     from service.jobs.job_schemas import JobIn
     from sysid.data.records import Record, Recording
     from sysid.identification.identify_arguments import ReadRecords
@@ -95,14 +96,6 @@ ResultFile = Annotated[
         rich_help_panel=OUTPUT_PANEL,
     ),
 ]
-
-
-@dataclass(frozen=True, slots=True)
-class FileOptions:
-    """Options for reading files."""
-
-    sample_time: float | None
-    segments: tuple[str, ...]
 
 
 def identify(
@@ -149,6 +142,7 @@ def identify(
     ] = False,
     segments: Segments = None,
     sample_time: SampleTime = None,
+    columns: Columns = None,
     report: Annotated[
         Path | None,
         typer.Option(
@@ -177,7 +171,10 @@ def identify(
     protect_file(output, force)
     unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(data, validation)
-    reading = FileOptions(sample_time, tuple(split_names(segments)))
+    from service.formats.read_options import build_options
+
+    with _report_unreadable(data):
+        reading = build_options(sample_time=sample_time, segments=segments, columns=columns)
     recording = read_input_file(data, reading)
     body, loaded = check_body(unchecked, max(1, len(recording.segments)))
     with _report_core_faults():
@@ -335,22 +332,24 @@ def _refuse_same_file(data: Path, validation: Path | None) -> None:
         )
 
 
-def read_input_file(path: Path, reading: FileOptions) -> "Recording":
+@contextmanager
+def _report_unreadable(path: Path) -> Iterator[None]:
+    """End the command if a file or an option of reading it cannot be used."""
+    try:
+        yield
+    except UnreadableFile as error:
+        fail(upload_origins(path).describe_faults(to_field_errors(error)))
+
+
+def read_input_file(path: Path, options: "ReadOptions") -> "Recording":
     """Read a recording from a file and print notes about it on stderr."""
-    from service.formats.limits import DEFAULT_LIMITS
     from service.formats.recordings import read_with_notes
     from sysid.models.unit_checks import list_unknown_unit_warnings
 
     check_file(path)
-    try:
-        recording, notes = read_with_notes(
-            read_file(path) if path == STANDARD_INPUT else path,
-            sample_time=reading.sample_time,
-            segments=reading.segments,
-            limits=DEFAULT_LIMITS,
-        )
-    except UnreadableFile as error:
-        fail(upload_origins(path).describe_faults(to_field_errors(error)))
+    with _report_unreadable(path):
+        source = read_file(path) if path == STANDARD_INPUT else path
+        recording, notes = read_with_notes(source, options)
     for note in (*notes, *list_unknown_unit_warnings(recording.channels)):
         err.print(f"note: {note}", markup=False)
     return recording

@@ -79,11 +79,13 @@ class Operations(Exchange):
         *,
         segments: str | None = None,
         sample_time: float | None = None,
+        columns: str | None = None,
     ) -> RestCall[documents.DatasetDocument]:
         """Store a recording from a file of any kind that is read, or from its bytes."""
         if not (isinstance(source, bytes) or Path(source).exists()):
             raise FileNotFoundError(f"there is no file {source}")
-        return build_upload(source, name, segments, sample_time)
+        options = {"segments": segments, "sample_time": sample_time, "columns": columns}
+        return build_upload(source, name, options)
 
     @fetch
     def simulate_dataset(self, body: Mapping[str, Any]) -> RestCall[documents.DatasetDocument]:

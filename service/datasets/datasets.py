@@ -28,8 +28,8 @@ from service.datasets.dataset_schemas import (
 )
 from service.datasets.stored_recordings import load_recording
 from service.formats.file_kinds import SUFFIXES, detect_kind
-from service.formats.limits import DEFAULT_LIMITS, UploadLimits
 from service.formats.mcap.mcap_files import write_recording
+from service.formats.read_options import DEFAULT_OPTIONS, ReadOptions
 from service.formats.sandbox import read_untrusted
 from service.repositories.dataset_rows import DatasetRepository, NewDataset, StoredDataset
 from service.repositories.lineage_rows import (
@@ -114,9 +114,7 @@ def add_upload(
     sha256: str,
     suffix: str = "",
     name: str | None = None,
-    segments: Sequence[str] = (),
-    sample_time: float | None = None,
-    limits: UploadLimits = DEFAULT_LIMITS,
+    options: ReadOptions = DEFAULT_OPTIONS,
 ) -> StoredDataset:
     """Store an uploaded file, or return the existing dataset of the same bytes.
 
@@ -130,12 +128,7 @@ def add_upload(
     UnreadableFile
         If the file cannot be used, with the position of the fault.
     """
-    read_as = {
-        "sha256": sha256,
-        "format": detect_kind(path, suffix),
-        "segments": list(segments),
-        "sample_time": sample_time,
-    }
+    read_as = {"sha256": sha256, "format": detect_kind(path, suffix), **options.list_given()}
     key = hash_source(read_as)
     _heal_object(database, store, path, sha256)
     with database.read_session() as session:
@@ -143,7 +136,7 @@ def add_upload(
     if existing is not None:
         return StoredDataset(existing, is_new=False)
     # Reading takes time. An open transaction would block all others on SQLite.
-    read = read_untrusted(path, limits, suffix=suffix, segments=segments, sample_time=sample_time)
+    read = read_untrusted(path, options, suffix=suffix)
     details = {"source": read_as, "warnings": list(read.notes)}
     return add_recording(
         database,

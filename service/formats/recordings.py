@@ -6,11 +6,8 @@ from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Protocol, runtime_checkable
 
-import numpy as np
-
-from service.formats.advice import build_period_error
 from service.formats.file_kinds import GZIP_MAGIC, detect_kind, read_head
-from service.formats.limits import DEFAULT_LIMITS, ReadOptions, UploadLimits
+from service.formats.read_options import DEFAULT_OPTIONS, ReadOptions, build_options
 from sysid.core.errors import UnreadableFile
 from sysid.data.foreign_tables import describe_value, is_labelled
 from sysid.data.records import Recording
@@ -30,6 +27,7 @@ def read_recording(
     *,
     sample_time: float | None = None,
     segments: Sequence[str] | str = (),
+    columns: Sequence[str] | str = (),
 ) -> Recording:
     r"""Read a recording: text of columns, Excel, Parquet, NumPy, MATLAB or MCAP.
 
@@ -44,7 +42,10 @@ def read_recording(
         Sampling period in s, for a file without a time column.
     segments : sequence of str
         Columns of labels that divide the rows into segments, each measured on its own. A text
-        is one column.
+        has commas between names.
+    columns : sequence of str
+        Names of the columns of a file without a header, ``"t,u,,y [V]"``. A column with an empty
+        name is left out.
 
     Raises
     ------
@@ -62,26 +63,19 @@ def read_recording(
     >>> recording.names, recording.channel("flow").unit, recording.duration
     (('valve', 'flow'), 'l/min', 0.2)
     """
-    recording, notes = read_with_notes(source, sample_time=sample_time, segments=segments)
+    options = build_options(sample_time=sample_time, segments=segments, columns=columns)
+    recording, notes = read_with_notes(source, options)
     tell_notes(notes)
     return recording
 
 
 def read_with_notes(
-    source: str | os.PathLike[str] | bytes | Readable,
-    *,
-    sample_time: float | None = None,
-    segments: Sequence[str] | str = (),
-    limits: UploadLimits = DEFAULT_LIMITS,
+    source: str | os.PathLike[str] | bytes | Readable, options: ReadOptions = DEFAULT_OPTIONS
 ) -> tuple[Recording, tuple[str, ...]]:
     """Read a recording, and return the notes with it; see `read_recording`.
 
     Plain text is read by this process, every other file by a child with limits.
     """
-    if sample_time is not None and not isinstance(sample_time, int | float | np.number):
-        raise build_period_error(sample_time)
-    labels = (segments,) if isinstance(segments, str) else tuple(segments)
-    options = ReadOptions(sample_time, labels, limits)
     content = source.read() if isinstance(source, Readable) else source
     if isinstance(content, str) and content is not source:
         content = content.encode()
@@ -114,13 +108,10 @@ def _read_file(path: Path, options: ReadOptions) -> tuple[Recording, tuple[str, 
         raise FileNotFoundError(f"there is no file {path}")
     from service.formats.tabular.csv_recordings import read_csv
 
-    sample_time, segments, limits = options.sample_time, options.segments, options.limits
     is_packed = read_head(path).startswith(GZIP_MAGIC)  # unpacking needs limits
     if detect_kind(path, path.suffix) == "csv" and not is_packed:
-        return read_csv(path, sample_time=sample_time, segments=segments, limits=limits)
+        return read_csv(path, options)
     from service.formats.sandbox import read_untrusted
 
-    upload = read_untrusted(
-        path, limits, suffix=path.suffix, sample_time=sample_time, segments=segments
-    )
+    upload = read_untrusted(path, options, suffix=path.suffix)
     return upload.recording, upload.notes

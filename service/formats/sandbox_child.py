@@ -8,8 +8,9 @@ from typing import Any
 
 from service.core.process.temporary_files import FULL_DISK_ERRORS
 from service.formats.file_kinds import FileKind
-from service.formats.limits import MIB, ReadOptions, UploadLimits
+from service.formats.limits import MIB, UploadLimits
 from service.formats.mcap.mcap_files import read_mcap_with_notes, write_recording
+from service.formats.read_options import ReadOptions
 from service.formats.tabular.csv_recordings import read_csv
 from service.formats.tabular.table_columns import Table
 from service.formats.tabular.table_recordings import build_recording
@@ -25,7 +26,8 @@ def main() -> int:
     A full disk is no fault of the file and has an answer of its own.
     """
     task = json.load(sys.stdin)
-    limits = UploadLimits(**task["limits"])
+    options = ReadOptions.from_document(task["options"])
+    limits = options.limits
     os.environ["POLARS_MAX_THREADS"] = "1"  # the stacks of its threads would count as memory
     limit_resources(
         seconds=limits.seconds,
@@ -33,7 +35,7 @@ def main() -> int:
         file_bytes=limits.total_bytes,
     )
     try:
-        answer: dict[str, Any] = {"notes": _convert_file(task, limits)}
+        answer: dict[str, Any] = {"notes": _convert_file(task, options)}
     except UnreadableFile as error:
         answer = {"error": _describe_error(error)}
     except OSError as error:
@@ -46,8 +48,7 @@ def main() -> int:
     return 0
 
 
-def _convert_file(task: dict[str, Any], limits: UploadLimits) -> list[str]:
-    options = ReadOptions(task["sample_time"], tuple(task["segments"]), limits)
+def _convert_file(task: dict[str, Any], options: ReadOptions) -> list[str]:
     recording, messages = read_file(Path(task["source"]), task["kind"], options)
     try:
         write_recording(recording, task["target"])
@@ -59,12 +60,7 @@ def _convert_file(task: dict[str, Any], limits: UploadLimits) -> list[str]:
 def read_file(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Recording, list[str]]:
     """Read a file of a kind, and return the notes with its recording."""
     if kind == "csv":
-        recording, notes = read_csv(
-            path,
-            sample_time=options.sample_time,
-            segments=options.segments,
-            limits=options.limits,
-        )
+        recording, notes = read_csv(path, options)
         return recording, list(notes)
     if kind == "mcap":
         recording, notes = read_mcap_with_notes(path, options.limits)

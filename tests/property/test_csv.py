@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from service.formats.read_options import ReadOptions
 from service.formats.tabular.csv_recordings import read_csv
 from sysid.core.errors import UnreadableFile
 from tests.support.profiles import scale_examples
@@ -47,5 +48,5 @@ def test_any_bytes_are_read_or_refused(
     content: bytes, sample_time: float | None, segments: tuple[str, ...]
 ) -> None:
     with suppress(UnreadableFile):
-        recording, _ = read_csv(content, sample_time=sample_time, segments=segments)
+        recording, _ = read_csv(content, ReadOptions(sample_time=sample_time, segments=segments))
         assert recording.samples > 0

@@ -45,6 +45,7 @@ from service.datasets.dataset_schemas import (
 )
 from service.datasets.stored_recordings import load_recording
 from service.formats.limits import UploadLimits
+from service.formats.read_options import build_options
 from service.formats.tabular.csv_recordings import generate_csv
 from service.items.item_schemas import DeletedOut, EditIn
 from service.repositories.dataset_rows import DatasetRepository, StoredDataset
@@ -80,6 +81,13 @@ Segments = Annotated[
 SampleTime = Annotated[
     float | None, Query(gt=0, description="sampling period in s, for a file without a time column")
 ]
+Columns = Annotated[
+    str | None,
+    Query(
+        description="names of the columns of a file without a header, `t,u,,y [V]`; a column with "
+        "an empty name is left out"
+    ),
+]
 
 
 @router.post("/datasets", status_code=201, openapi_extra=UPLOAD_BODY, responses=EXISTING_DATASET)
@@ -90,6 +98,7 @@ async def add_dataset(
     name: Name = None,
     segments: Segments = None,
     sample_time: SampleTime = None,
+    columns: Columns = None,
 ) -> DatasetOut:
     """Store a recording: CSV or other text, Excel, Parquet, NumPy, MATLAB or MCAP.
 
@@ -108,10 +117,13 @@ async def add_dataset(
             sha256=upload.sha256,
             suffix=upload.suffix or Path(name or "").suffix,
             name=name or upload.name,
-            segments=[column.strip() for column in (segments or "").split(",") if column.strip()],
-            sample_time=sample_time,
-            limits=UploadLimits(
-                file_bytes=settings.max_upload_bytes, memory_bytes=settings.reader_memory_bytes
+            options=build_options(
+                sample_time=sample_time,
+                segments=segments,
+                columns=columns,
+                limits=UploadLimits(
+                    file_bytes=settings.max_upload_bytes, memory_bytes=settings.reader_memory_bytes
+                ),
             ),
         )
     return _dataset_response(stored, response, name)

@@ -5,6 +5,7 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,7 +13,8 @@ import numpy as np
 from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
-from service.formats.limits import ReadOptions
+from service.formats.advice import name_columns
+from service.formats.read_options import ReadOptions
 from service.formats.tabular.table_columns import (
     ColumnValues,
     Table,
@@ -24,6 +26,7 @@ from service.formats.tabular.table_layout import (
     PEEK_ROWS,
     TableColumn,
     assign_roles,
+    check_count,
     classify_cells,
     read_headings,
 )
@@ -50,9 +53,7 @@ def read_numpy(path: Path, options: ReadOptions, notes: list[str]) -> Table:
     except _DAMAGES as error:
         raise _build_damage_error("NumPy", error) from None
     if "" in arrays:
-        raise UnreadableFile(
-            "the .npy file holds one array without names; write np.savez(file, t=t, u=u, y=y)"
-        )
+        arrays = _split_matrix(arrays[""], options)
     return _build_array_table(arrays, options, notes)
 
 
@@ -69,6 +70,19 @@ def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
                 with archive.open(name) as member:
                     arrays[name.removesuffix(".npy")] = read_array(member)
             return arrays
+
+
+def _split_matrix(matrix: NDArray[Any], options: ReadOptions) -> dict[str, NDArray[Any]]:
+    """Split an array without names into its columns, which the user named."""
+    if matrix.ndim not in (1, 2):
+        raise UnreadableFile(f"the array has {matrix.ndim} dimensions; need rows and columns")
+    matrix = matrix.reshape(matrix.shape[0], -1)
+    if not options.columns:
+        raise UnreadableFile(
+            "the .npy file holds one array without names; write np.savez(file, t=t, u=u, y=y), or ",
+            name_columns(matrix.shape[1], has_times=False),
+        )
+    return {f"c{number}": column for number, column in enumerate(matrix.T, 1)}
 
 
 def read_matlab(path: Path, options: ReadOptions, notes: list[str]) -> Table:
@@ -127,12 +141,13 @@ def _open_simulink(fields: Mapping[str, Any]) -> dict[str, Any]:
 def _build_array_table(arrays: Mapping[str, Any], options: ReadOptions, notes: list[str]) -> Table:
     columns, left_out = _collect_columns(arrays)
     sample_time = options.sample_time
-    times = [name for name in columns if is_time_name(name) and not is_temperature_name(name)]
+    names = [name for name, _ in read_headings(options.columns or list(columns))]
+    times = [name for name in names if is_time_name(name) and not is_temperature_name(name)]
     if sample_time is None and not times:
         sample_time = _find_period(arrays, notes)
     if left_out:
         notes.append(f"{', '.join(left_out)} hold no samples of a signal and were left out")
-    return build_column_table(columns, ReadOptions(sample_time, options.segments, options.limits))
+    return build_column_table(columns, replace(options, sample_time=sample_time))
 
 
 def _collect_columns(arrays: Mapping[str, Any]) -> tuple[dict[str, ColumnValues], list[str]]:
@@ -263,15 +278,14 @@ def build_column_table(
     """
     if not columns or not len(next(iter(columns.values()))):
         raise UnreadableFile("the file holds no samples")
+    if options.columns:
+        check_count(options.columns, len(columns), has_times=False)
+    names = list(options.columns or columns)
     headings = [
         Heading(name, "s" if label in spans else unit, _classify_values(values, name))
-        for (name, unit), (label, values) in zip(
-            read_headings(list(columns)), columns.items(), strict=True
-        )
+        for (name, unit), (label, values) in zip(read_headings(names), columns.items(), strict=True)
     ]
-    roles = assign_roles(
-        headings, options.segments, options.sample_time, options.limits.channels, None
-    )
+    roles = assign_roles(headings, options, None)
     rows = np.arange(1, len(next(iter(columns.values()))) + 1)
     values = tuple(
         _convert_values(role, column, rows)
