@@ -124,6 +124,14 @@ Columns = Annotated[
         "name is left out.",
     ),
 ]
+Missing = Annotated[
+    str | None,
+    typer.Option(
+        metavar="MARKER,…",
+        help="Words and numbers that mark bad data: -9999,Offline. none: no number does. By "
+        "default words such as Bad do, and numbers such as -9999 that stand apart.",
+    ),
+]
 DATA_HELP = "Recording: text (CSV), Excel, Parquet, NumPy, MATLAB or MCAP; - for standard input."
 AsJson = Annotated[
     bool,
@@ -552,7 +560,7 @@ def format_decimals(value: float | None) -> str | None:
 INVALID_STATUS = 422
 UPLOAD_OPTIONS = {
     f"?{name}": f"--{name.replace('_', '-')}"
-    for name in ("name", "segments", "sample_time", "columns")
+    for name in ("name", "segments", "sample_time", "columns", "missing")
 }
 POINTER_PATTERN = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
 """Pointers in a message: to a field of that name elsewhere, or to a fault in an axis value."""

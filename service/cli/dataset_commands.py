@@ -16,6 +16,7 @@ from service.cli.common import (
     FieldOrigins,
     Force,
     Limit,
+    Missing,
     SampleTime,
     Segments,
     check_file,
@@ -132,6 +133,7 @@ def add_datasets(
     segments: Segments = None,
     sample_time: SampleTime = None,
     columns: Columns = None,
+    missing: Missing = None,
     as_json: bool = False,
 ) -> None:
     """Store recordings."""
@@ -145,7 +147,12 @@ def add_datasets(
         with report_faults(upload_origins(file)):
             stored.append(
                 client.add_dataset(
-                    source, name, segments=segments, sample_time=sample_time, columns=columns
+                    source,
+                    name,
+                    segments=segments,
+                    sample_time=sample_time,
+                    columns=columns,
+                    missing=missing,
                 )
             )
         if not as_json:

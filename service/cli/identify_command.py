@@ -21,6 +21,7 @@ from service.cli.common import (
     Columns,
     FieldOrigins,
     Force,
+    Missing,
     ModelName,
     Quiet,
     SampleTime,
@@ -143,6 +144,7 @@ def identify(
     segments: Segments = None,
     sample_time: SampleTime = None,
     columns: Columns = None,
+    missing: Missing = None,
     report: Annotated[
         Path | None,
         typer.Option(
@@ -174,7 +176,9 @@ def identify(
     from service.formats.read_options import build_options
 
     with _report_unreadable(data):
-        reading = build_options(sample_time=sample_time, segments=segments, columns=columns)
+        reading = build_options(
+            sample_time=sample_time, segments=segments, columns=columns, missing=missing
+        )
     recording = read_input_file(data, reading)
     body, loaded = check_body(unchecked, max(1, len(recording.segments)))
     with _report_core_faults():

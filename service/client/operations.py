@@ -80,11 +80,17 @@ class Operations(Exchange):
         segments: str | None = None,
         sample_time: float | None = None,
         columns: str | None = None,
+        missing: str | None = None,
     ) -> RestCall[documents.DatasetDocument]:
         """Store a recording from a file of any kind that is read, or from its bytes."""
         if not (isinstance(source, bytes) or Path(source).exists()):
             raise FileNotFoundError(f"there is no file {source}")
-        options = {"segments": segments, "sample_time": sample_time, "columns": columns}
+        options = {
+            "segments": segments,
+            "sample_time": sample_time,
+            "columns": columns,
+            "missing": missing,
+        }
         return build_upload(source, name, options)
 
     @fetch

@@ -24,6 +24,9 @@ class ReadOptions:
     columns : tuple of str
         Names of the columns, in their order, for a file without a header: ``t``, ``u [V]``. A
         column with an empty name is left out.
+    missing : tuple of str
+        Words and numbers that mark bad data. If there are any, no other number does; ``none``
+        alone says that no number does.
     limits : UploadLimits
 
     Raises
@@ -35,6 +38,7 @@ class ReadOptions:
     sample_time: float | None = None
     segments: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
     limits: UploadLimits = DEFAULT_LIMITS
 
     def __post_init__(self) -> None:
@@ -73,6 +77,7 @@ def build_options(
     sample_time: float | None = None,
     segments: Sequence[str] | str | None = None,
     columns: Sequence[str] | str | None = None,
+    missing: Sequence[str | float] | str | None = None,
     limits: UploadLimits = DEFAULT_LIMITS,
 ) -> ReadOptions:
     """Build options from what a user typed: lists, or texts with commas.
@@ -86,10 +91,11 @@ def build_options(
         sample_time=sample_time,
         segments=tuple(name for name in _split(segments) if name),
         columns=_split(columns),
+        missing=tuple(word for word in _split(missing) if word),
         limits=limits,
     )
 
 
-def _split(names: Sequence[str] | str | None) -> tuple[str, ...]:
+def _split(names: Sequence[str | float] | str | None) -> tuple[str, ...]:
     parts = names.split(",") if isinstance(names, str) else names or ()
-    return tuple(part.strip() for part in parts)
+    return tuple(str(part).strip() for part in parts)

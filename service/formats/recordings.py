@@ -28,6 +28,7 @@ def read_recording(
     sample_time: float | None = None,
     segments: Sequence[str] | str = (),
     columns: Sequence[str] | str = (),
+    missing: Sequence[str | float] | str = (),
 ) -> Recording:
     r"""Read a recording: text of columns, Excel, Parquet, NumPy, MATLAB or MCAP.
 
@@ -46,6 +47,9 @@ def read_recording(
     columns : sequence of str
         Names of the columns of a file without a header, ``"t,u,,y [V]"``. A column with an empty
         name is left out.
+    missing : sequence of str or float
+        Words and numbers that mark bad data, ``"-9999,Offline"``. If there are any, no other
+        number is taken for one; ``"none"`` says that no number is.
 
     Raises
     ------
@@ -63,7 +67,9 @@ def read_recording(
     >>> recording.names, recording.channel("flow").unit, recording.duration
     (('valve', 'flow'), 'l/min', 0.2)
     """
-    options = build_options(sample_time=sample_time, segments=segments, columns=columns)
+    options = build_options(
+        sample_time=sample_time, segments=segments, columns=columns, missing=missing
+    )
     recording, notes = read_with_notes(source, options)
     tell_notes(notes)
     return recording

@@ -66,7 +66,7 @@ def read_file(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Recordi
         recording, notes = read_mcap_with_notes(path, options.limits)
         return recording, [*notes, *_check_finite_values(recording)]
     table, messages = _read_table(path, kind, options)
-    return build_recording(table, messages), messages
+    return build_recording(table, options, messages), messages
 
 
 def _read_table(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Table, list[str]]:

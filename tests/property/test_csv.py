@@ -19,7 +19,7 @@ def test_printed_numbers_come_back_bit_for_bit(
     values: list[float], separator: str, end: str
 ) -> None:
     rows = [f"t{separator}u", *(f"{k}{separator}{value!r}" for k, value in enumerate(values))]
-    recording, _ = read_csv((end.join(rows) + end).encode())
+    recording, _ = read_csv((end.join(rows) + end).encode(), ReadOptions(missing=("none",)))
     assert recording.channel("u").values.tobytes() == np.array(values).tobytes()
 
 

@@ -89,6 +89,14 @@ Columns = Annotated[
     ),
 ]
 
+Missing = Annotated[
+    str | None,
+    Query(
+        description="words and numbers that mark bad data, `-9999,Offline`; if there are any, no "
+        "other number is taken for one, and with `none` no number is"
+    ),
+]
+
 
 @router.post("/datasets", status_code=201, openapi_extra=UPLOAD_BODY, responses=EXISTING_DATASET)
 async def add_dataset(
@@ -99,6 +107,7 @@ async def add_dataset(
     segments: Segments = None,
     sample_time: SampleTime = None,
     columns: Columns = None,
+    missing: Missing = None,
 ) -> DatasetOut:
     """Store a recording: CSV or other text, Excel, Parquet, NumPy, MATLAB or MCAP.
 
@@ -121,6 +130,7 @@ async def add_dataset(
                 sample_time=sample_time,
                 segments=segments,
                 columns=columns,
+                missing=missing,
                 limits=UploadLimits(
                     file_bytes=settings.max_upload_bytes, memory_bytes=settings.reader_memory_bytes
                 ),

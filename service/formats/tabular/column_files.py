@@ -287,14 +287,15 @@ def build_column_table(
     ]
     roles = assign_roles(headings, options, None)
     rows = np.arange(1, len(next(iter(columns.values()))) + 1)
+    bad_words = Counter[tuple[str, str]]()
     values = tuple(
-        _convert_values(role, column, rows)
+        _convert_values(role, column, rows, bad_words)
         for role, column in zip(roles, columns.values(), strict=True)
     )
     is_utc = any(
         role.role == "time" and label in in_utc for role, label in zip(roles, columns, strict=True)
     )
-    return Table(roles, values, rows, options.sample_time, is_utc)
+    return Table(roles, values, rows, options.sample_time, is_utc, bad_words)
 
 
 def _classify_values(values: ColumnValues, name: str) -> CellKind:
@@ -306,12 +307,17 @@ def _classify_values(values: ColumnValues, name: str) -> CellKind:
     return classify_cells(peek, name)
 
 
-def _convert_values(column: TableColumn, values: ColumnValues, rows: IntArray) -> ColumnValues:
+def _convert_values(
+    column: TableColumn,
+    values: ColumnValues,
+    rows: IntArray,
+    bad_words: Counter[tuple[str, str]],
+) -> ColumnValues:
     """Convert the values of a column to numbers, texts or time stamps, and check them."""
     if values.dtype.kind == "U":
         texts = [str(text).strip() for text in values]
         if holds_numbers(column):
-            return parse_texts(column, texts, rows)
+            return parse_texts(column, texts, rows, bad_words)
         return np.array(texts, dtype=np.str_)
     if values.dtype.kind == "M":
         if column.role == "time" and (missing := np.flatnonzero(np.isnat(values))).size:

@@ -54,7 +54,7 @@ def read_csv(
         layout, first = detect_layout(lines, options)
         notes += layout.notes
         table = read_lines(chain(first, lines), layout, notes, options.limits.messages)
-    return build_recording(table, notes), tuple(notes)
+    return build_recording(table, options, notes), tuple(notes)
 
 
 WRITTEN_BLOCK_ROWS = 5000

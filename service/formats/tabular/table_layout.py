@@ -59,12 +59,16 @@ ColumnRole = Literal["time", "date", "label", "value", "nameless", "text", "unus
 
 @dataclass(frozen=True, slots=True)
 class TableColumn:
-    """One column: its name without the unit, its unit, what it holds and its role."""
+    """One column: its name without the unit, its unit, what it holds and its role.
+
+    `bad_words` are those by which the user's file marks a bad value, in small letters.
+    """
 
     name: str
     unit: str
     kind: CellKind
     role: ColumnRole
+    bad_words: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -531,8 +535,9 @@ def assign_roles(
         If a name is missing or occurs twice, a label column is missing, or there is no signal or no
         time. Also if the time is given twice.
     """
+    bad_words = frozenset(word.lower() for word in options.missing)
     named = [
-        TableColumn(*heading, role=_find_role(heading, is_named=bool(options.columns)))
+        TableColumn(*heading, _find_role(heading, is_named=bool(options.columns)), bad_words)
         for heading in headings
     ]
     _check_names(named, options, row)

@@ -1,5 +1,6 @@
 """Make a recording of the columns of a table: times, segments, channels, and notes."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import floor, log10
@@ -7,6 +8,8 @@ from math import floor, log10
 import numpy as np
 
 from service.formats.advice import GIVE_PERIOD
+from service.formats.read_options import ReadOptions
+from service.formats.tabular.bad_values import apply_status_columns, mask_markers
 from service.formats.tabular.cells import begins_like_number, classify_cell
 from service.formats.tabular.table_columns import (
     ColumnValues,
@@ -71,7 +74,7 @@ def _round_up_step(longest: float) -> float:
     return next(step for m in (1, 2, 5, 10, 20) if (step := m * decade) > longest)
 
 
-def build_recording(table: Table, notes: list[str]) -> Recording:
+def build_recording(table: Table, options: ReadOptions, notes: list[str]) -> Recording:
     """Build the recording of a table; each guess and each finding becomes a note.
 
     Raises
@@ -79,7 +82,7 @@ def build_recording(table: Table, notes: list[str]) -> Recording:
     UnreadableFile
         If the columns cannot be used, with the row and the column.
     """
-    table = _name_signals(table, notes)
+    table = apply_status_columns(_name_signals(table, notes), notes)
     _check_left_out(table, notes)
     labels = [column.name for column in table.columns if column.role == "label"]
     starts = _find_segment_starts(table, labels)
@@ -94,11 +97,13 @@ def build_recording(table: Table, notes: list[str]) -> Recording:
         if column.role != "value":
             continue
         numbers = np.asarray(values, dtype=np.float64)
+        numbers = mask_markers(column.name, numbers, options.missing, notes)
         if np.isnan(numbers).all():
             empty.append(column.name)
             continue
         if column.kind == "flag":
             notes.append(f"channel {column.name!r}: true and false were read as 1 and 0")
+        _report_bad_words(column.name, table, notes)
         _report_missing_values(column.name, numbers, table, notes)
         channels.append(Channel(column.name, times, numbers, column.unit or "1"))
     if not channels:
@@ -118,7 +123,7 @@ def _name_signals(table: Table, notes: list[str]) -> Table:
         if column.role == "nameless" and any(texts) and not counts_rows(texts):
             columns[place] = replace(column, role="value", kind="number")
             if values[place].dtype.kind == "U":
-                values[place] = parse_texts(columns[place], texts, table.rows)
+                values[place] = parse_texts(columns[place], texts, table.rows, Counter())
         if columns[place].role == "value":
             notes.append(f"column {column.name!r} does not count the rows, so it is a signal")
     return replace(table, columns=tuple(columns), values=tuple(values))
@@ -304,6 +309,13 @@ def _report_irregular_sampling(times: FloatArray, notes: list[str]) -> None:
             f"sampling is irregular: {gaps.min():.4g} to {gaps.max():.4g} s between samples, "
             f"median {sampling.period:.4g} s. Each sample is used at its own time."
         )
+
+
+def _report_bad_words(name: str, table: Table, notes: list[str]) -> None:
+    found = {word: count for (column, word), count in table.bad_words.items() if column == name}
+    if found:
+        listed = ", ".join(f"{word!r} ({count})" for word, count in found.items())
+        notes.append(f"channel {name!r}: words that mark bad values were read as missing: {listed}")
 
 
 def _report_missing_values(name: str, values: FloatArray, table: Table, notes: list[str]) -> None:

@@ -201,7 +201,7 @@ def test_repeated_and_decreasing_times_are_told_with_both_values(rows: str, word
         ("t [V],u\n0,1\n", "times are in [V]; need seconds, or another unit of time"),
         ("t [Hz],u\n0,1\n", "need seconds"),
         ("t;u\n0.5;1,5\n", "other numbers of the file have points"),
-        ("t;u\n1,5;2,5\n2,5;abc.d\n", "name it in segments"),
+        ("t;u\n1,5;2,5\n2,5;abc.d\n", "marks a bad value, give missing=abc.d"),
         ("t,u,u\n0,1,2\n", "names must differ"),
         ("t,u\n0,1\n1\n", "has 1 fields, but the header has 2"),
         ("t,u\n0,1\n1,2,3\n", "has 3 fields, but the header has 2"),

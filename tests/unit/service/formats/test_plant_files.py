@@ -107,3 +107,96 @@ def test_options_travel_as_json() -> None:
     assert ReadOptions.from_document(options.to_document()) == options
     with pytest.raises(UnreadableFile, match="sample_time is 0; need a positive number"):
         ReadOptions(0)
+
+
+MARKED = OUTPUT.copy()
+MARKED[[7, 8, 100]] = np.nan
+
+
+def write_marked(marker: str, header: str = "t,u,y", end: str = "", bad: str = "") -> str:
+    """The experiment with a marker in place of three values, and columns of status after it."""
+    lines = [header]
+    for t, u, y in zip(TIMES, INPUT, MARKED, strict=True):
+        is_bad = np.isnan(y)
+        lines.append(f"{t:.1f},{u:g},{marker if is_bad else f'{y:.6f}'}{bad if is_bad else end}")
+    return "\n".join(lines) + "\n"
+
+
+MARKERS = [
+    "Bad",
+    "I/O Timeout",
+    "No Data",
+    "unavailable",
+    ".",
+    "-9999",
+    "-9999.0",
+    "-999.25",
+    "1e20",
+]
+
+
+@pytest.mark.parametrize("marker", MARKERS)
+def test_markers_of_bad_data_are_missing_and_told(marker: str) -> None:
+    recording, notes = read(write_marked(marker))
+    np.testing.assert_array_equal(recording.channel("y").values, MARKED)
+    np.testing.assert_array_equal(recording.channel("u").values, INPUT)
+    told = " ".join(notes)
+    assert "channel 'y': 3 of 240 values are missing" in told
+    if marker != ".":
+        shown = repr(marker) if marker[0].isalpha() else f"{float(marker):.16g}"
+        assert shown in told
+
+
+@pytest.mark.parametrize("marker", ["-7", "Offline 2"])
+def test_a_marker_is_given(marker: str) -> None:
+    np.testing.assert_array_equal(
+        read(write_marked(marker), missing=marker)[0].channel("y").values, MARKED
+    )
+
+
+def test_an_unknown_word_is_refused_with_the_option_and_that_works() -> None:
+    error = refuse(write_marked("Wartung Pumpe"))
+    assert str(error) == (
+        "row 9, column 'y': found 'Wartung Pumpe', which is not a number; if it marks a bad value, "
+        "give missing='Wartung Pumpe'"
+    )
+    assert error.advice is not None
+    given = error.advice.after.strip("='")
+    recording, _ = read(write_marked("Wartung Pumpe"), missing=given)
+    np.testing.assert_array_equal(recording.channel("y").values, MARKED)
+
+
+def test_a_number_that_does_not_stand_apart_is_a_value() -> None:
+    near = np.where(np.isnan(MARKED), 999.0, 500.0 + 300.0 * OUTPUT)
+    rows = "".join(f"{t},{y}\n" for t, y in zip(TIMES, near, strict=True))
+    np.testing.assert_array_equal(read("t,y\n" + rows)[0].channel("y").values, near)
+    levels = "t,u\n" + "".join(f"{t},{-9999 if t < 5 else 0}\n" for t in TIMES)
+    assert not np.isnan(read(levels)[0].channel("u").values).any()
+    kept = read(write_marked("-9999"), missing="none")[0].channel("y").values
+    assert np.count_nonzero(kept == -9999) == 3
+
+
+STATUS = {
+    "words beside a channel": write_marked("7.5", "t,u,y,y_status", ",Good", ",Bad"),
+    "words for all": write_marked("7.5", "t,u,y,Quality", ',"Good, annotated"', ",Uncertain"),
+    "codes of OPC": write_marked("7.5", "t,u,y,y quality", ",192", ",24"),
+    "truth": write_marked("7.5", "t,u,y,y.IsGood", ",True", ",False"),
+    "numbers of truth": write_marked("7.5", "t,u,y,y valid", ",1", ",0"),
+}
+
+
+@pytest.mark.parametrize("text", STATUS.values(), ids=STATUS)
+def test_columns_of_status_are_recognised(text: str) -> None:
+    recording, notes = read(text)
+    assert recording.names == ("u", "y")
+    np.testing.assert_array_equal(recording.channel("y").values, MARKED)
+    assert any("3 are bad and read as missing" in note for note in notes)
+
+
+def test_a_status_of_a_machine_is_none_of_its_values() -> None:
+    recording, _ = read(write_marked("7.5", "t,u,y,y status", ",1", ",0"))
+    assert recording.names == ("u", "y", "y status")
+    recording, notes = read(write_marked("7.5", "t,u,y,status", ",heating", ",idle"))
+    assert recording.names == ("u", "y")
+    assert not np.isnan(recording.channel("y").values).any()
+    assert "column 'status' holds text ('heating') and was left out" in notes
