@@ -156,10 +156,11 @@ def is_nameless(heading: Heading) -> bool:
 
 def is_index_name(name: str) -> bool:
     """Whether a column of this name is left out if it counts rows: ``No.``, ``Sample #``, none."""
-    return name.lower() in NO_NAMES or _simplify_name(name).removesuffix(".") in _INDEX_WORDS
+    return name.lower() in NO_NAMES or simplify_name(name).removesuffix(".") in _INDEX_WORDS
 
 
-def _simplify_name(name: str) -> str:
+def simplify_name(name: str) -> str:
+    """Return a name in small letters, with one blank between its words."""
     return " ".join(re.sub(r"[_-]", " ", name.lower()).split())
 
 
@@ -222,7 +223,7 @@ def is_time_name(name: str) -> bool:
 
 def find_time_word(name: str) -> str | None:
     """Return the usual name of time that a name is, without a unit at its end."""
-    text = _simplify_name(name)
+    text = simplify_name(name)
     if text in _TIME_WORDS:
         return text
     word, _, unit = text.rpartition(" ")

@@ -21,6 +21,7 @@ from service.core.label_text import unescape_formula
 from service.formats.advice import GIVE_PERIOD, name_columns
 from service.formats.read_options import ReadOptions
 from service.formats.tabular.cells import begins_like_number, classify_cell, classify_column
+from service.formats.tabular.long_headings import find_long_places
 from sysid.core.errors import Advice, UnreadableFile, suggest_name
 from sysid.data.table_rules import (
     STAMP_KINDS,
@@ -53,8 +54,13 @@ _MAX_LISTED = 8  # columns named in a message
 _UNIT_FIELD = re.compile(r"^(\[.*\]|\(.*\))$")
 
 _T = TypeVar("_T")
-ColumnRole = Literal["time", "date", "label", "value", "nameless", "text", "unused"]
-"""``date`` completes a time of day; ``nameless``, ``text`` and ``unused`` are no signals."""
+ColumnRole = Literal[
+    "time", "date", "label", "value", "nameless", "text", "unused", "key", "entry", "unit"
+]
+"""``date`` completes a time of day; ``nameless``, ``text`` and ``unused`` are no signals.
+
+In a long table ``key`` names the signal of a row, ``entry`` has its value and ``unit`` its unit.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,10 +287,10 @@ def _begins_with_word(fields: Sequence[str]) -> bool:
 
 
 def _is_data(fields: Sequence[str]) -> bool:
-    """Whether a row is one of data: its first field is, or most of its fields are."""
+    """Whether a row is one of data: its first field is, most are, or one is a time stamp."""
     kinds = [kind for kind in map(classify_cell, fields) if kind != "empty"]
     count = sum(kind != "text" for kind in kinds)
-    return count > 0 and (kinds[0] != "text" or 2 * count > len(kinds))
+    return count > 0 and (kinds[0] != "text" or 2 * count > len(kinds) or "stamp" in kinds)
 
 
 def _is_header_of(fields: Sequence[str], below: Sequence[str]) -> bool:
@@ -552,6 +558,8 @@ def assign_roles(
                 f"there is no label column {label!r}{suggest_name(label, names)}", row=row
             )
     columns = _assign_time(columns, options.sample_time, row)
+    if options.sample_time is None:
+        columns = _assign_long_roles(columns)
     columns = [
         replace(c, role="text") if c.role == "value" and c.kind in ("text", *STAMP_KINDS) else c
         for c in columns
@@ -560,7 +568,7 @@ def assign_roles(
         if column.role == "nameless" and column.kind not in ("empty", "count"):
             raise build_nameless_error(number, row)
     signals = sum(column.role == "value" for column in columns)
-    if signals == 0 and not any(column.role == "text" for column in columns):
+    if signals == 0 and not any(column.role in ("text", "entry") for column in columns):
         raise UnreadableFile("there is no signal: every column is time or a label")
     if signals > options.limits.channels:
         raise UnreadableFile(
@@ -569,6 +577,23 @@ def assign_roles(
             row=row,
         )
     return tuple(columns)
+
+
+def _assign_long_roles(columns: Sequence[TableColumn]) -> list[TableColumn]:
+    """Give the columns of a long table their roles, if names of signals stand below a heading."""
+    places = find_long_places(
+        [
+            Heading(column.name, column.unit, column.kind) if column.role == "value" else None
+            for column in columns
+        ]
+    )
+    roles = list(columns)
+    if places is not None:
+        roles[places.key] = replace(columns[places.key], role="key")
+        roles[places.entry] = replace(columns[places.entry], role="entry")
+        if places.unit is not None:
+            roles[places.unit] = replace(columns[places.unit], role="unit")
+    return roles
 
 
 def _find_role(heading: Heading, *, is_named: bool) -> ColumnRole:

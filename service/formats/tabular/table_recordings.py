@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import floor, log10
+from shlex import quote
 
 import numpy as np
 
@@ -11,6 +12,13 @@ from service.formats.advice import GIVE_PERIOD
 from service.formats.read_options import ReadOptions
 from service.formats.tabular.bad_values import apply_status_columns, mask_markers
 from service.formats.tabular.cells import begins_like_number, classify_cell
+from service.formats.tabular.long_tables import (
+    Signal,
+    find_long_table,
+    list_signals,
+    list_wide_signals,
+    sort_rows,
+)
 from service.formats.tabular.table_columns import (
     ColumnValues,
     Table,
@@ -83,34 +91,52 @@ def build_recording(table: Table, options: ReadOptions, notes: list[str]) -> Rec
         If the columns cannot be used, with the row and the column.
     """
     table = apply_status_columns(_name_signals(table, notes), notes)
-    _check_left_out(table, notes)
     labels = [column.name for column in table.columns if column.role == "label"]
     starts = _find_segment_starts(table, labels)
     clock = _build_times(table, starts, notes)
+    long = find_long_table(table, clock.seconds, starts)
+    if long is not None:
+        long, clock = sort_rows(long, clock, starts)
+        table = long.table
+    _check_left_out(table, notes)
     times, spans = clock.seconds, tuple[Segment, ...]()
+    signals = [] if long is None else list_signals(long, notes)
+    signals += list_wide_signals(table, times, starts, is_sparse=long is not None, notes=notes)
+    is_wide = all(signal.rows.size == times.size for signal in signals)
+    if is_wide:
+        _check_order(times, starts, table, notes)
     if labels:
         times, spans = _build_segments(table, labels, times, starts, notes)
-    else:
+    elif is_wide:
         _report_irregular_sampling(times, notes)
+    channels = _build_channels(signals, table, times, options, notes)
+    return Recording(channels, spans, clock.started_at)
+
+
+def _build_channels(
+    signals: Sequence[Signal],
+    table: Table,
+    times: FloatArray,
+    options: ReadOptions,
+    notes: list[str],
+) -> tuple[Channel, ...]:
+    """Build the channels of signals, without markers of bad data; tell what is missing."""
     channels, empty = [], []
-    for column, values in zip(table.columns, table.values, strict=True):
-        if column.role != "value":
-            continue
-        numbers = np.asarray(values, dtype=np.float64)
-        numbers = mask_markers(column.name, numbers, options.missing, notes)
+    for signal in signals:
+        numbers = mask_markers(signal.name, signal.values, options.missing, notes)
         if np.isnan(numbers).all():
-            empty.append(column.name)
+            empty.append(signal.name)
             continue
-        if column.kind == "flag":
-            notes.append(f"channel {column.name!r}: true and false were read as 1 and 0")
-        _report_bad_words(column.name, table, notes)
-        _report_missing_values(column.name, numbers, table, notes)
-        channels.append(Channel(column.name, times, numbers, column.unit or "1"))
+        if signal.kind == "flag":
+            notes.append(f"channel {signal.name!r}: true and false were read as 1 and 0")
+        _report_bad_words(signal.name, table, notes)
+        _report_missing_values(signal.name, numbers, table.rows[signal.rows], notes)
+        channels.append(Channel(signal.name, times[signal.rows], numbers, signal.unit or "1"))
     if not channels:
         raise UnreadableFile("every value is missing; leave the column out", column=empty[0])
     if empty:
         notes.append(f"columns without any value were left out: {', '.join(empty)}")
-    return Recording(tuple(channels), spans, clock.started_at)
+    return tuple(channels)
 
 
 def _name_signals(table: Table, notes: list[str]) -> Table:
@@ -198,8 +224,6 @@ def _build_times(table: Table, starts: IntArray, notes: list[str]) -> TimeAxis:
         return TimeAxis(np.concatenate(counts) * sample_time, start)
     assert time is not None  # checked with the layout
     assert clock is not None
-    _check_increasing(clock.seconds, starts, table, time)
-    _report_repeated_times(clock.seconds, starts, notes)
     return clock
 
 
@@ -264,6 +288,14 @@ def _parse_labels(column: ColumnValues) -> list[float | str]:
     return list(numbers) if np.isfinite(numbers).all() else list(texts)
 
 
+def _check_order(times: FloatArray, starts: IntArray, table: Table, notes: list[str]) -> None:
+    """Refuse times of a file that do not increase inside a segment, and tell those that repeat."""
+    time = next((column for column in table.columns if column.role == "time"), None)
+    if time is not None and table.sample_time is None:
+        _check_increasing(times, starts, table, time)
+        _report_repeated_times(times, starts, notes)
+
+
 def _check_increasing(times: FloatArray, starts: IntArray, table: Table, time: TableColumn) -> None:
     """Refuse times that do not increase inside a segment."""
     is_stamp = not holds_numbers(time)
@@ -279,7 +311,10 @@ def _check_increasing(times: FloatArray, starts: IntArray, table: Table, time: T
     several = "If the file has several measurements, "
     hint = f"Remove the row if it is a fault of the logger. {several}"
     advice = Advice("name the columns that number them with ", "segments", ".")
-    if is_stamp:
+    label = _find_label(table, times)
+    if label:
+        hint, advice = several, Advice("divide it by ", "segments", f"={quote(label)}.")
+    elif is_stamp:
         hint, advice = "If the stamps are too coarse, ", GIVE_PERIOD
     elif before == after:
         hint = f"{several}give the columns that number them as segments. "
@@ -292,6 +327,17 @@ def _check_increasing(times: FloatArray, starts: IntArray, table: Table, time: T
         row=int(table.rows[wrong[0] + 1]),
         column=time.name,
     )
+
+
+def _find_label(table: Table, times: FloatArray) -> str:
+    """Find the column that changes where the times go back, and nowhere else; empty if none."""
+    resets = np.diff(times) < 0
+    if not resets.any():
+        return ""
+    for column, values in zip(table.columns, table.values, strict=True):
+        if column.role in ("value", "text") and np.array_equal(values[1:] != values[:-1], resets):
+            return column.name
+    return ""
 
 
 def _report_repeated_times(times: FloatArray, starts: IntArray, notes: list[str]) -> None:
@@ -318,12 +364,12 @@ def _report_bad_words(name: str, table: Table, notes: list[str]) -> None:
         notes.append(f"channel {name!r}: words that mark bad values were read as missing: {listed}")
 
 
-def _report_missing_values(name: str, values: FloatArray, table: Table, notes: list[str]) -> None:
+def _report_missing_values(name: str, values: FloatArray, rows: IntArray, notes: list[str]) -> None:
     missing = np.flatnonzero(np.isnan(values))
     if missing.size == 0:
         return
     notes.append(
         f"channel {name!r}: {missing.size} of {values.size} values are missing (empty or NaN), the "
-        f"first in row {table.rows[missing[0]]}. An output is not scored at missing values. "
+        f"first in row {rows[missing[0]]}. An output is not scored at missing values. "
         "An input with missing values cannot be used."
     )

@@ -1,6 +1,7 @@
 """Files as plants write them: without a header, with markers of bad data, in long format."""
 
 import io
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
@@ -200,3 +201,100 @@ def test_a_status_of_a_machine_is_none_of_its_values() -> None:
     assert recording.names == ("u", "y")
     assert not np.isnan(recording.channel("y").values).any()
     assert "column 'status' holds text ('heating') and was left out" in notes
+
+
+CLOCK = datetime(2026, 11, 1, 10, tzinfo=UTC)
+LATER = TIMES[3::2] + 0.025  # s, times of a sensor with a clock of its own
+
+
+def write_long(
+    header: str, row: str, *, order: str = "by signal", times: str = "%Y-%m-%dT%H:%M:%S.%fZ"
+) -> str:
+    """Two signals, each with its own times: a held input `valve`, and an output `flow`."""
+    rows = [(t, "valve", f"{u:g}", "%") for t, u in zip(TIMES, INPUT, strict=True)]
+    rows += [(t, "flow", f"{np.sin(t):.6f}", "l/min") for t in LATER]
+    if order != "by signal":
+        rows.sort(key=lambda one: one[0], reverse=order == "latest first")
+    lines = [header]
+    for t, name, value, unit in rows:
+        moment = (CLOCK + timedelta(seconds=float(t))).strftime(times) if times else f"{t:.3f}"
+        lines.append(row.format(t=moment, name=name, value=value, unit=unit))
+    return "\n".join(lines) + "\n"
+
+
+LONG = {
+    "Home Assistant": write_long("entity_id,state,last_changed", "{name},{value},{t}"),
+    "interleaved": write_long(
+        "entity_id,state,last_changed", "{name},{value},{t}", order="by time"
+    ),
+    "latest first": write_long("timestamp,tag,value", "{t},{name},{value}", order="latest first"),
+    "historian with units": write_long(
+        "TagName;Timestamp;Value;Unit", "{name};{t};{value};{unit}", order="by time"
+    ),
+    "seconds": write_long("time,sensor,reading", "{t},{name},{value}", times=""),
+    "no usual heading": write_long("when,wo,was", "{t},{name},{value}"),
+    "blanks": write_long("t name value", "{t} {name} {value}", times=""),
+    "without a header": write_long("", "{t},{name},{value}", times="").lstrip(),
+}
+
+
+@pytest.mark.parametrize("text", LONG.values(), ids=LONG)
+def test_a_row_for_each_value_becomes_channels_with_their_own_times(text: str) -> None:
+    named = not text[0].isalpha()
+    recording, notes = read(text, **({"columns": "t,tag,value"} if named else {}))
+    assert set(recording.names) == {"valve", "flow"}
+    np.testing.assert_allclose(recording.channel("valve").times, TIMES, atol=1e-9)
+    np.testing.assert_array_equal(recording.channel("valve").values, INPUT)
+    np.testing.assert_allclose(recording.channel("flow").times, LATER, atol=1e-9)
+    np.testing.assert_allclose(recording.channel("flow").values, np.sin(LATER), atol=1e-6)
+    assert any("names the signals of column" in note for note in notes)
+    if "Z" in text:
+        assert recording.started_at == CLOCK
+    if "Unit" in text:
+        assert [channel.unit for channel in recording.channels] == ["%", "l/min"]
+
+
+def test_states_of_words_and_bad_rows_of_a_long_table_are_left_out_and_told() -> None:
+    rows = [
+        *("heater,on", "heater,off", "heater,on"),
+        *("room,20.5", "room,unavailable", "room,21.5", "mode,heat", "mode,idle"),
+    ]
+    text = "entity_id,state,last_changed\n"
+    text += "".join(f"{row},2026-11-01T10:00:{i:02d}Z\n" for i, row in enumerate(rows))
+    recording, notes = read(text)
+    assert recording.names == ("heater", "room")
+    assert recording.channel("heater").values.tolist() == [1.0, 0.0, 1.0]
+    assert recording.channel("room").times.tolist() == [3.0, 5.0]
+    assert "signals of words were left out: mode" in notes
+    assert "rows whose word marks a bad value were left out: 'unavailable' (1)" in notes
+    assert "row 6, column 'state'" in str(refuse(text.replace("unavailable", "wet")))
+    assert "write dates too" in str(refuse("tag,time,value\na,12:00:00,1\na,12:00:01,2\n"))
+
+
+NONMEM = (
+    "ID,TIME,AMT,DV,DVID,EVID\n1,0,100,.,.,1\n1,0,.,0.5,1,0\n1,1,.,3,1,0\n1,1,.,80,2,0\n"
+    "1,2,.,2.5,1,0\n1,2,.,70,2,0\n1,12,100,.,.,1\n1,12,.,0.5,1,0\n"
+)
+
+
+def test_rows_of_doses_and_observations_are_channels() -> None:
+    recording, notes = read(NONMEM)
+    assert recording.names == ("DVID 1", "DVID 2", "AMT")
+    assert recording.channel("DVID 2").values.tolist() == [80.0, 70.0]
+    assert recording.channel("AMT").times.tolist() == [0.0, 12.0]
+    assert any("several values at a time were left out: ID, EVID" in note for note in notes)
+    single = "ID,TIME,AMT,DV\n1,0,100,.\n1,0,.,0.5\n1,1,.,3\n1,2,.,2.5\n"
+    assert read(single)[0].channel("DV").times.tolist() == [0.0, 1.0, 2.0]
+    two = single + single.partition("\n")[2].replace("1,", "2,", 1).replace("\n1,", "\n2,")
+    error = refuse(two)
+    assert str(error).endswith("If the file has several measurements, divide it by segments=ID.")
+    recording, _ = read(two, segments="ID")
+    assert [segment.labels["ID"] for segment in recording.segments] == [1.0, 2.0]
+    assert recording.channel("DV").values.tolist() == [0.5, 3.0, 2.5, 0.5, 3.0, 2.5]
+
+
+def test_measurements_below_each_other_are_no_long_table() -> None:
+    rows = "".join(f"{run},{t:.1f},{t},{t}\n" for run in "AB" for t in TIMES)
+    error = refuse("run,t,u,y\n" + rows)
+    assert str(error).endswith("divide it by segments=run.")
+    assert len(read("run,t,u,y\n" + rows, segments="run")[0].segments) == 2
