@@ -8,14 +8,14 @@ from typing import Literal
 
 from sysid.core.errors import UnreadableFile
 
-FileKind = Literal["csv", "mcap", "excel", "parquet", "numpy", "matlab"]
+FileKind = Literal["csv", "mcap", "excel", "parquet", "numpy", "matlab", "json"]
 """``csv`` is every table in text, also compressed by gzip."""
 
 HEAD_BYTES = 65_536
 GZIP_MAGIC = b"\x1f\x8b"
 SUFFIXES = (
     *(".csv", ".txt", ".tsv", ".dat", ".asc", ".gz", ".mcap", ".mat", ".npz", ".npy"),
-    *(".xlsx", ".xlsm", ".xlsb", ".xls", ".ods", ".parquet"),
+    *(".xlsx", ".xlsm", ".xlsb", ".xls", ".ods", ".parquet", ".json", ".jsonl", ".ndjson"),
 )
 """Suffixes of files that are read; any text is read whatever its suffix."""
 
@@ -48,11 +48,6 @@ _REFUSED_MAGICS: tuple[tuple[bytes, str, str], ...] = (
 )
 _REFUSED_PATTERNS: tuple[tuple[re.Pattern[bytes], str, str], ...] = (
     (
-        re.compile(rb'(\xef\xbb\xbf)?\s*(\{\s*["}]|\[\s*[\[{"\d+-])'),
-        "JSON",
-        "write the signals as columns of a CSV file: t,u,y",
-    ),
-    (
         re.compile(rb"(\xef\xbb\xbf)?\s*<(\?xml|!doctype|html)", re.IGNORECASE),
         "XML or HTML",
         "export the table as CSV or Excel",
@@ -63,6 +58,7 @@ _REFUSED_PATTERNS: tuple[tuple[re.Pattern[bytes], str, str], ...] = (
         "write the table as Parquet or .npz",
     ),
 )
+_JSON = re.compile(rb'(\xef\xbb\xbf)?\s*(\{\s*["}]|\[\s*[\[{"\d+-])')
 _SHEET_PARTS = (b"[Content_Types].xml", b"_rels/", b"docProps/", b"xl/")
 _OPEN_SHEET = b"application/vnd.oasis.opendocument.spreadsheet"
 _MAX_MAT4_NAME = 64
@@ -101,6 +97,8 @@ def detect_head_kind(head: bytes, suffix: str = "") -> FileKind:
     if head.startswith(b"PK\x03\x04"):
         return _detect_archive_kind(head)
     _refuse_other_kinds(head)
+    if _JSON.match(head):
+        return "json"
     if suffix == ".mcap":
         return "mcap"
     return "matlab" if suffix == ".mat" or _is_mat4(head) else "csv"

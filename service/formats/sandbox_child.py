@@ -76,6 +76,10 @@ def _read_table(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Table
         from service.formats.tabular.sheet_files import read_sheets
 
         return read_sheets(path, options, messages), messages
+    if kind == "json":
+        from service.formats.tabular.json_files import read_json
+
+        return read_json(path, options, messages), messages
     from service.formats.tabular.column_files import read_matlab, read_numpy, read_parquet
 
     read = {"numpy": read_numpy, "matlab": read_matlab, "parquet": read_parquet}[kind]

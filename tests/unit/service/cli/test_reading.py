@@ -46,7 +46,7 @@ def test_a_refusal_names_the_file_and_the_options(
     path.write_text("t,n,u\n0,1,1\n1,2,2\n2,3,3\n")
     assert "leave columns of times and signals out of --segments" in refuse(path, capsys, "n")
     path.write_text('{"t": []}')
-    assert "the file is JSON, which is not read; write the signals" in refuse(path, capsys)
+    assert "the JSON holds no list of records. Write one for each time" in refuse(path, capsys)
 
 
 def test_refusals_of_the_server_name_options_too(capsys: pytest.CaptureFixture[str]) -> None:

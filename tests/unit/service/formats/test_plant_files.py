@@ -1,6 +1,7 @@
 """Files as plants write them: without a header, with markers of bad data, in long format."""
 
 import io
+import json
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
@@ -298,3 +299,74 @@ def test_measurements_below_each_other_are_no_long_table() -> None:
     error = refuse("run,t,u,y\n" + rows)
     assert str(error).endswith("divide it by segments=run.")
     assert len(read("run,t,u,y\n" + rows, segments="run")[0].segments) == 2
+
+
+RECORDS = [{"t": t, "u": u, "y": y} for t, u, y in ROWS]
+HISTORY = [
+    [
+        {
+            "entity_id": name,
+            "state": f"{value:g}",
+            "last_changed": (CLOCK + timedelta(seconds=t)).isoformat(),
+        }
+        for t, value in zip(TIMES.tolist(), values.tolist(), strict=True)
+    ]
+    for name, values in (("u", INPUT), ("y", OUTPUT))
+]
+MINIMAL = [
+    [
+        one if i == 0 else {n: v for n, v in one.items() if n != "entity_id"}
+        for i, one in enumerate(part)
+    ]
+    for part in HISTORY
+]
+JSON = {
+    "records": json.dumps(RECORDS),
+    "lines of records": "\n".join(map(json.dumps, RECORDS)),
+    "inside an object": json.dumps({"rig": 7, "result": {"data": RECORDS}}),
+    "nested": json.dumps(
+        [{"t": r["t"], "u": r["u"], "y": r["y"], "at": {"x": None}} for r in RECORDS]
+    ),
+    "Home Assistant": json.dumps(HISTORY),
+    "Home Assistant, minimal": json.dumps(MINIMAL),
+    "list for each signal": json.dumps(
+        {
+            name: [
+                {"ts": 1000 * t, "value": str(v)}
+                for t, v in zip(TIMES.tolist(), values, strict=True)
+            ]
+            for name, values in (("u", INPUT.tolist()), ("y", OUTPUT.tolist()))
+        }
+    ).replace('"ts"', '"time_ms"'),
+    "names and rows": json.dumps({"columns": ["t", "u", "y"], "index": [0], "data": ROWS}),
+    "series": json.dumps({"results": 1, "fields": [{"name": n} for n in "tuy"], "values": ROWS}),
+}
+
+
+@pytest.mark.parametrize("text", JSON.values(), ids=JSON)
+def test_json_of_records_is_a_table(text: str) -> None:
+    recording, _ = read(text)
+    assert set(recording.names) == {"u", "y"}
+    for name, values in (("u", INPUT), ("y", OUTPUT)):
+        np.testing.assert_allclose(recording.channel(name).times, TIMES, atol=1e-9)
+        np.testing.assert_allclose(recording.channel(name).values, values, rtol=1e-5)
+
+
+REFUSED_JSON = {
+    "arrays": ('{"t": [0, 1], "u": [0, 1]}', "holds no list of records. Write one for each time"),
+    "cut off": ('[{"t": 0, "u": 1}, {"t": 1', "begins like JSON and is none: "),
+    "second line": ('{"t": 0, "u": 1}\n{"t": 1, "u": 2]}\n', "begins like JSON and is none: "),
+    "word": ('[{"t": 0, "u": 1}, {"t": 1, "u": "5 V"}]', "row 2, column 'u': found '5 V'"),
+    "no time": ('[{"u": 1, "y": 2}, {"u": 2, "y": 3}]', "there is no time column; found u, y."),
+    "deep": ("[" * 100_000, "nested too deeply"),
+}
+
+
+@pytest.mark.parametrize(("text", "words"), REFUSED_JSON.values(), ids=REFUSED_JSON)
+def test_json_without_records_is_refused(text: str, words: str) -> None:
+    assert words in str(refuse(text))
+
+
+def test_rows_of_json_without_names_take_columns() -> None:
+    assert "so the file has no header" in str(refuse(json.dumps(ROWS)))
+    check_experiment(read(json.dumps(ROWS), columns="t,u,y")[0])

@@ -296,8 +296,7 @@ REFUSED = {
     "thousands": ("t;y\n0.1;1,000.5\n0.2;1,001.5\n", "thousands separators"),
     "no header": (BODY, "so the file has no header; name its columns with columns=t,c1,c2"),
     "no time": (join_rows("a,u,y"), "give the sampling period"),
-    "JSON": ('{"t": [0, 1], "u": [0, 1]}', "the file is JSON, which is not read; write the"),
-    "JSON lines": ('[{"t": 0}]', "JSON"),
+    "JSON of one column": ('[{"t": 0}]', "there is only one column ('t')"),
     "XML": ('<?xml version="1.0"?><a/>', "XML or HTML, which is not read"),
 }
 
