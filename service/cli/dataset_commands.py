@@ -59,7 +59,9 @@ if TYPE_CHECKING:
     from service.client.client import Client
 
 
-app = typer.Typer(help="Add, show, download, simulate and derive recordings.", no_args_is_help=True)
+app = typer.Typer(
+    help="Add, show, download, simulate, derive and join recordings.", no_args_is_help=True
+)
 
 DATASET_ID = "ds_"
 
@@ -256,6 +258,22 @@ def simulate_dataset(
         body["parameters"] = {**(body.get("parameters") or {}), **values}
     with report_faults(_field_origins(file, sets)):
         return client.simulate_dataset(body)
+
+
+@app.command("join", epilog=show_examples("lagid dataset join supply room --name heating"))
+@server_command(_print_dataset)
+def join_datasets(
+    client: "Client",
+    datasets: Annotated[
+        list[str], typer.Argument(metavar="DATASET…", help="Ids or names of the recordings.")
+    ],
+    name: Annotated[str | None, typer.Option(help="Name of the new dataset.")] = None,
+) -> Mapping[str, Any]:
+    """Join recordings of several loggers on one clock; nothing is resampled."""
+    if len(datasets) < 2:
+        fail_usage(f"need two or more recordings to join; found {datasets[0]}")
+    with report_faults(FieldOrigins({"/datasets": "DATASET", "/name": "--name"})):
+        return client.join(datasets, name)
 
 
 @app.command(

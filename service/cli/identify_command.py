@@ -100,9 +100,12 @@ ResultFile = Annotated[
 
 
 def identify(
-    data: Annotated[
-        Path,
-        typer.Argument(metavar="DATA", help=DATA_HELP),
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="DATA…",
+            help=f"{DATA_HELP} Files of several loggers are joined on one clock.",
+        ),
     ],
     model: ModelName,
     changes: Annotated[
@@ -171,18 +174,19 @@ def identify(
     if report is not None:
         _check_report(report, force)
     protect_file(output, force)
+    data = _name_files(files)
     unchecked = _build_body(data, model, changes, parse_channels(channels))
-    _refuse_same_file(data, validation)
+    _refuse_same_file(files[0], validation)
     from service.formats.read_options import build_options
 
-    with _report_unreadable(data):
+    with _report_unreadable(files[0]):
         reading = build_options(
             sample_time=sample_time, segments=segments, columns=columns, missing=missing
         )
-    recording = read_input_file(data, reading)
+    recording = read_input_files(files, reading)
     body, loaded = check_body(unchecked, max(1, len(recording.segments)))
     with _report_core_faults():
-        read = _extract_records(recording, Path(name_file(data)), loaded, body)
+        read = _extract_records(recording, data, loaded, body)
         validation_records: Sequence[Record] = ()
         if validation is not None:
             validation_records = _extract_records(
@@ -202,7 +206,7 @@ def identify(
     result = add_reading_notes(result, read.notes)
     print_result(result, seconds, output, as_json=as_json, printed=printed)
     if report is not None:
-        _write_report(report, Path(name_file(data)), loaded, result, seconds, body)
+        _write_report(report, data, loaded, result, seconds, body)
 
 
 def _check_report(path: Path, force: bool) -> None:
@@ -336,24 +340,38 @@ def _refuse_same_file(data: Path, validation: Path | None) -> None:
         )
 
 
+def _name_files(files: Sequence[Path]) -> Path:
+    """Name the files of a recording in one: ``supply + room``."""
+    if len(files) == 1:
+        return Path(name_file(files[0]))
+    return Path(" + ".join(Path(name_file(file)).stem for file in files))
+
+
 @contextmanager
 def _report_unreadable(path: Path) -> Iterator[None]:
     """End the command if a file or an option of reading it cannot be used."""
     try:
         yield
     except UnreadableFile as error:
-        fail(upload_origins(path).describe_faults(to_field_errors(error)))
+        place = Path(error.name) if error.name else path
+        fail(upload_origins(place).describe_faults(to_field_errors(error)))
 
 
 def read_input_file(path: Path, options: "ReadOptions") -> "Recording":
     """Read a recording from a file and print notes about it on stderr."""
+    return read_input_files([path], options)
+
+
+def read_input_files(paths: Sequence[Path], options: "ReadOptions") -> "Recording":
+    """Read files, join them on one clock, and print notes on stderr."""
     from service.formats.recordings import read_with_notes
     from sysid.models.unit_checks import list_unknown_unit_warnings
 
-    check_file(path)
-    with _report_unreadable(path):
-        source = read_file(path) if path == STANDARD_INPUT else path
-        recording, notes = read_with_notes(source, options)
+    for path in paths:
+        check_file(path)
+    with _report_unreadable(_name_files(paths)):
+        sources = [read_file(path) if path == STANDARD_INPUT else path for path in paths]
+        recording, notes = read_with_notes(sources, options)
     for note in (*notes, *list_unknown_unit_warnings(recording.channels)):
         err.print(f"note: {note}", markup=False)
     return recording

@@ -99,6 +99,13 @@ class Operations(Exchange):
         return call("POST /v1/datasets:simulate", json=body)
 
     @fetch
+    def join(
+        self, datasets: list[str], name: str | None = None
+    ) -> RestCall[documents.DatasetDocument]:
+        """Make a dataset of several recordings on one clock; nothing is resampled."""
+        return call("POST /v1/datasets:join", json={"name": name, "datasets": datasets})
+
+    @fetch
     def derive(
         self, dataset: str, steps: list[Document], name: str | None = None
     ) -> RestCall[documents.DatasetDocument]:

@@ -6,6 +6,7 @@ Requests name a dataset by its identifier, or by a name that is unique.
 import hashlib
 import json
 import tempfile
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +21,7 @@ from service.datasets.dataset_schemas import (
     DatasetOut,
     DatasetPage,
     DeriveIn,
+    JoinIn,
     LineageEdgeOut,
     LineageOut,
     SeriesOut,
@@ -162,9 +164,7 @@ def derive_dataset(
         If a step is not possible.
     """
     with database.read_session() as session:
-        parent = resolve_dataset(session, parent_id)
-        if isinstance(parent, str):
-            raise DatasetNotFound(parent)
+        parent = _find_parent(session, parent_id)
         existing = find_existing(session, store, _hash_derivation(parent, body))
     if existing is not None:
         return StoredDataset(existing, is_new=False)
@@ -187,6 +187,47 @@ def derive_dataset(
         },
         parents=[parent.id],
     )
+
+
+def join_datasets(database: Database, store: ObjectStore, body: JoinIn) -> StoredDataset:
+    """Join recordings on one clock; the same ones again return the same dataset.
+
+    Raises
+    ------
+    DatasetNotFound
+        If no dataset has that identifier or name, or several share the name.
+    InvalidRecord
+        If they cannot be joined.
+    """
+    from sysid.data.joining import join_recordings
+
+    with database.read_session() as session:
+        parents = [_find_parent(session, name) for name in body.datasets]
+        key = hash_source({"join": [parent.id for parent in parents]})
+        existing = find_existing(session, store, key)
+    if existing is not None:
+        return StoredDataset(existing, is_new=False)
+    shared = Counter(parent.name for parent in parents)
+    names = [one.name if shared[one.name] == 1 else one.id for one in parents]
+    recordings = [load_recording(store, parent.sha256) for parent in parents]
+    recording, notes = join_recordings(dict(zip(names, recordings, strict=True)))
+    return add_recording(
+        database,
+        store,
+        recording,
+        name=body.name or " + ".join(names)[:200],
+        kind="derive",
+        key=key,
+        details={"steps": [{"join": [parent.id for parent in parents]}], "warnings": list(notes)},
+        parents=[parent.id for parent in parents],
+    )
+
+
+def _find_parent(session: Session, name: str) -> Dataset:
+    parent = resolve_dataset(session, name)
+    if isinstance(parent, str):
+        raise DatasetNotFound(parent)
+    return parent
 
 
 def add_recording(

@@ -4,12 +4,13 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeAlias, runtime_checkable
 
 from service.formats.file_kinds import GZIP_MAGIC, detect_kind, read_head
 from service.formats.read_options import DEFAULT_OPTIONS, ReadOptions, build_options
-from sysid.core.errors import UnreadableFile
+from sysid.core.errors import InvalidRecord, UnreadableFile
 from sysid.data.foreign_tables import describe_value, is_labelled
+from sysid.data.joining import join_recordings
 from sysid.data.records import Recording
 from sysid.data.table_rules import tell_notes
 
@@ -22,8 +23,12 @@ class Readable(Protocol):
         """Return the content that is left."""
 
 
+Source: TypeAlias = str | os.PathLike[str] | bytes | Readable
+"""A file's path, its content, or an open file."""
+
+
 def read_recording(
-    source: str | os.PathLike[str] | bytes | Readable,
+    source: Source | Sequence[Source],
     *,
     sample_time: float | None = None,
     segments: Sequence[str] | str = (),
@@ -37,8 +42,9 @@ def read_recording(
 
     Parameters
     ----------
-    source : path, bytes or open file
-        A file's path, its content, or an object that can be read.
+    source : path, bytes or open file, or a sequence of them
+        A file's path, its content, or an object that can be read. Several files, each with its
+        own times, are joined on one clock; nothing is resampled.
     sample_time : float or None
         Sampling period in s, for a file without a time column.
     segments : sequence of str
@@ -76,12 +82,14 @@ def read_recording(
 
 
 def read_with_notes(
-    source: str | os.PathLike[str] | bytes | Readable, options: ReadOptions = DEFAULT_OPTIONS
+    source: Source | Sequence[Source], options: ReadOptions = DEFAULT_OPTIONS
 ) -> tuple[Recording, tuple[str, ...]]:
     """Read a recording, and return the notes with it; see `read_recording`.
 
     Plain text is read by this process, every other file by a child with limits.
     """
+    if isinstance(source, list | tuple):
+        return _read_several(source, options)
     content = source.read() if isinstance(source, Readable) else source
     if isinstance(content, str) and content is not source:
         content = content.encode()
@@ -102,6 +110,30 @@ def read_with_notes(
     except UnreadableFile as error:
         error.name = str(source)
         raise
+
+
+def _read_several(
+    sources: Sequence[Source], options: ReadOptions
+) -> tuple[Recording, tuple[str, ...]]:
+    """Read files and join them on one clock; the notes of each name it."""
+    if not sources:
+        raise UnreadableFile("there is no file in the list; need one or more")
+    recordings: dict[str, Recording] = {}
+    notes: list[str] = []
+    for number, source in enumerate(sources, 1):
+        recording, told = read_with_notes(source, options)
+        if len(sources) == 1:
+            return recording, told
+        is_path = isinstance(source, str | os.PathLike)
+        name = Path(source).stem if is_path else f"file {number}"
+        name = name if name not in recordings else f"{name} {number}"
+        recordings[name] = recording
+        notes += [f"{name}: {note}" for note in told]
+    try:
+        recording, joined = join_recordings(recordings)
+    except InvalidRecord as error:
+        raise UnreadableFile(str(error)) from None
+    return recording, (*notes, *joined)
 
 
 _NO_FILE = " A table is a recording already: give it to identify, or to Recording"

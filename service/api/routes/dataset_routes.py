@@ -39,6 +39,7 @@ from service.datasets.dataset_schemas import (
     DatasetOut,
     DatasetPage,
     DeriveIn,
+    JoinIn,
     LineageOut,
     SignalsOut,
     SimulateIn,
@@ -153,6 +154,13 @@ def derive_dataset(
 ) -> DatasetOut:
     """Derive a dataset from another, by its id or name: add noise, resample, trim, select etc."""
     stored = datasets.derive_dataset(parts.database, parts.store, dataset_id, body)
+    return _dataset_response(stored, response, body.name)
+
+
+@router.post("/datasets:join", status_code=201, responses=EXISTING_DATASET)
+def join_datasets(body: JoinIn, parts: PartsDep, response: Response) -> DatasetOut:
+    """Join recordings of several loggers on one clock; nothing is resampled."""
+    stored = datasets.join_datasets(parts.database, parts.store, body)
     return _dataset_response(stored, response, body.name)
 
 

@@ -3,6 +3,7 @@
 import io
 import json
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,6 +52,7 @@ HEADERLESS = {
     "assignment": f"data7=[\n{BODY.replace(',', ' ')}];\n",
     "comments": f"% DaISy: no names\n% of columns\n{BODY.replace(',', ' ')}",
     "sheet": write_sheet(ROWS),
+    "ends of rows": BODY.replace("\n", ",\n"),
     "array": save_array(ROWS),
 }
 
@@ -370,3 +372,28 @@ def test_json_without_records_is_refused(text: str, words: str) -> None:
 def test_rows_of_json_without_names_take_columns() -> None:
     assert "so the file has no header" in str(refuse(json.dumps(ROWS)))
     check_experiment(read(json.dumps(ROWS), columns="t,u,y")[0])
+
+
+def test_files_of_several_loggers_are_joined_on_one_clock(tmp_path: Path) -> None:
+    clocks = {"supply": (0.0, INPUT), "room": (2.5, OUTPUT)}
+    for name, (late, values) in clocks.items():
+        stamps = [CLOCK + timedelta(seconds=late + t) for t in TIMES.tolist()]
+        rows = "".join(f"{s.isoformat()};{v:.6f};\n" for s, v in zip(stamps, values, strict=True))
+        (tmp_path / f"{name}.csv").write_text(f"timestamp;{name} [degC];\n{rows}")
+    paths = [tmp_path / "supply.csv", tmp_path / "room.csv"]
+    recording, notes = read_with_notes(paths)
+    assert recording.names == ("supply", "room")
+    assert recording.started_at == CLOCK
+    np.testing.assert_allclose(recording.channel("room").times, TIMES + 2.5)
+    assert "clocks are joined: supply begins first, room begins 2.5 s later" in notes
+    assert any(note.startswith("room: column 'timestamp' read as UTC") for note in notes)
+    contents, _ = read_with_notes([path.read_bytes() for path in paths])
+    assert contents.names == ("supply", "room")
+    assert read_with_notes(paths[:1])[0].names == ("supply",)
+    with pytest.raises(UnreadableFile, match="file 1 has dates and file 2 none"):
+        read_with_notes([paths[0].read_bytes(), join_rows("t,u,y").encode()])
+    with pytest.raises(UnreadableFile, match="no file in the list"):
+        read_with_notes([])
+    (tmp_path / "bad.csv").write_text("t,u\n0,5 V\n1,2\n")
+    with pytest.raises(UnreadableFile, match=r"bad\.csv: row 2, column 'u': found '5 V'"):
+        read_with_notes([paths[0], tmp_path / "bad.csv"])
