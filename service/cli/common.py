@@ -132,6 +132,15 @@ Missing = Annotated[
         "default words such as Bad do, and numbers such as -9999 that stand apart.",
     ),
 ]
+McapClock = Annotated[
+    str | None,
+    typer.Option(
+        "--clock",
+        metavar="[log|publish|stamp]",
+        help="Times of an MCAP file: when a message was logged (default) or sent, or the stamp in "
+        "its header.",
+    ),
+]
 DATA_HELP = "Recording: text (CSV), Excel, Parquet, NumPy, MATLAB or MCAP; - for standard input."
 AsJson = Annotated[
     bool,
@@ -560,7 +569,7 @@ def format_decimals(value: float | None) -> str | None:
 INVALID_STATUS = 422
 UPLOAD_OPTIONS = {
     f"?{name}": f"--{name.replace('_', '-')}"
-    for name in ("name", "segments", "sample_time", "columns", "missing")
+    for name in ("name", "segments", "sample_time", "columns", "missing", "clock")
 }
 POINTER_PATTERN = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
 """Pointers in a message: to a field of that name elsewhere, or to a fault in an axis value."""

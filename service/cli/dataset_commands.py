@@ -16,6 +16,7 @@ from service.cli.common import (
     FieldOrigins,
     Force,
     Limit,
+    McapClock,
     Missing,
     SampleTime,
     Segments,
@@ -136,6 +137,7 @@ def add_datasets(
     sample_time: SampleTime = None,
     columns: Columns = None,
     missing: Missing = None,
+    clock: McapClock = None,
     as_json: bool = False,
 ) -> None:
     """Store recordings."""
@@ -155,6 +157,7 @@ def add_datasets(
                     sample_time=sample_time,
                     columns=columns,
                     missing=missing,
+                    clock=clock,
                 )
             )
         if not as_json:

@@ -21,6 +21,7 @@ from service.cli.common import (
     Columns,
     FieldOrigins,
     Force,
+    McapClock,
     Missing,
     ModelName,
     Quiet,
@@ -148,6 +149,7 @@ def identify(
     sample_time: SampleTime = None,
     columns: Columns = None,
     missing: Missing = None,
+    clock: McapClock = None,
     report: Annotated[
         Path | None,
         typer.Option(
@@ -181,7 +183,11 @@ def identify(
 
     with _report_unreadable(files[0]):
         reading = build_options(
-            sample_time=sample_time, segments=segments, columns=columns, missing=missing
+            sample_time=sample_time,
+            segments=segments,
+            columns=columns,
+            missing=missing,
+            clock=clock,
         )
     recording = read_input_files(files, reading)
     body, loaded = check_body(unchecked, max(1, len(recording.segments)))

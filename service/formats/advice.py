@@ -2,6 +2,7 @@
 
 from sysid.core.errors import Advice, UnreadableFile
 
+LEAVE_CLOCK = Advice("leave out ", "clock")
 _MAX_NAMED = 12  # columns in a proposal of names
 
 GIVE_PERIOD = Advice("give the sampling period with ", "sample_time", ".")

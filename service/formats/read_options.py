@@ -2,12 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Final
+from typing import Any, Final, Literal, TypeAlias, cast, get_args
 
 import numpy as np
 
 from service.formats.advice import build_period_error
 from service.formats.limits import DEFAULT_LIMITS, UploadLimits
+from sysid.core.errors import Advice, UnreadableFile
+
+Clock: TypeAlias = Literal["log", "publish", "stamp"]
+"""Times of the messages of an MCAP file: when each was logged, was sent, or was measured."""
+CLOCKS: Final[tuple[Clock, ...]] = get_args(Clock)
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,21 +32,27 @@ class ReadOptions:
     missing : tuple of str
         Words and numbers that mark bad data. If there are any, no other number does; ``none``
         alone says that no number does.
+    clock : {"log", "publish", "stamp"}
+        Times of an MCAP file: when a message was logged or sent, or the stamp in its header.
     limits : UploadLimits
 
     Raises
     ------
     UnreadableFile
-        If the sampling period is no positive number.
+        If the sampling period is no positive number, or there is no such clock.
     """
 
     sample_time: float | None = None
     segments: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
+    clock: Clock = "log"
     limits: UploadLimits = DEFAULT_LIMITS
 
     def __post_init__(self) -> None:
+        if self.clock not in CLOCKS:
+            what = f" is {self.clock!r}; need {', '.join(CLOCKS[:-1])} or {CLOCKS[-1]}"
+            raise UnreadableFile("", Advice("", "clock", what))
         if self.sample_time is None:
             return
         is_number = isinstance(self.sample_time, int | float | np.number)
@@ -78,6 +89,7 @@ def build_options(
     segments: Sequence[str] | str | None = None,
     columns: Sequence[str] | str | None = None,
     missing: Sequence[str | float] | str | None = None,
+    clock: str | None = None,
     limits: UploadLimits = DEFAULT_LIMITS,
 ) -> ReadOptions:
     """Build options from what a user typed: lists, or texts with commas.
@@ -92,6 +104,7 @@ def build_options(
         segments=tuple(name for name in _split(segments) if name),
         columns=_split(columns),
         missing=tuple(word for word in _split(missing) if word),
+        clock=cast(Clock, clock or "log"),
         limits=limits,
     )
 

@@ -7,7 +7,7 @@ from tempfile import NamedTemporaryFile
 from typing import Protocol, TypeAlias, runtime_checkable
 
 from service.formats.file_kinds import GZIP_MAGIC, detect_kind, read_head
-from service.formats.read_options import DEFAULT_OPTIONS, ReadOptions, build_options
+from service.formats.read_options import DEFAULT_OPTIONS, Clock, ReadOptions, build_options
 from sysid.core.errors import InvalidRecord, UnreadableFile
 from sysid.data.foreign_tables import describe_value, is_labelled
 from sysid.data.joining import join_recordings
@@ -34,6 +34,7 @@ def read_recording(
     segments: Sequence[str] | str = (),
     columns: Sequence[str] | str = (),
     missing: Sequence[str | float] | str = (),
+    clock: Clock = "log",
 ) -> Recording:
     r"""Read a recording: text of columns, Excel, Parquet, NumPy, MATLAB or MCAP.
 
@@ -56,6 +57,8 @@ def read_recording(
     missing : sequence of str or float
         Words and numbers that mark bad data, ``"-9999,Offline"``. If there are any, no other
         number is taken for one; ``"none"`` says that no number is.
+    clock : {"log", "publish", "stamp"}
+        Times of an MCAP file: when a message was logged or sent, or the stamp in its header.
 
     Raises
     ------
@@ -74,7 +77,7 @@ def read_recording(
     (('valve', 'flow'), 'l/min', 0.2)
     """
     options = build_options(
-        sample_time=sample_time, segments=segments, columns=columns, missing=missing
+        sample_time=sample_time, segments=segments, columns=columns, missing=missing, clock=clock
     )
     recording, notes = read_with_notes(source, options)
     tell_notes(notes)
@@ -147,7 +150,8 @@ def _read_file(path: Path, options: ReadOptions) -> tuple[Recording, tuple[str, 
     from service.formats.tabular.csv_recordings import read_csv
 
     is_packed = read_head(path).startswith(GZIP_MAGIC)  # unpacking needs limits
-    if detect_kind(path, path.suffix) == "csv" and not is_packed:
+    is_plain = detect_kind(path, path.suffix) == "csv" and not is_packed
+    if is_plain and options.clock == DEFAULT_OPTIONS.clock:
         return read_csv(path, options)
     from service.formats.sandbox import read_untrusted
 

@@ -4,9 +4,10 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from service.core.process.temporary_files import FULL_DISK_ERRORS
+from service.formats.advice import LEAVE_CLOCK
 from service.formats.file_kinds import FileKind
 from service.formats.limits import MIB, UploadLimits
 from service.formats.mcap.mcap_files import read_mcap_with_notes, write_recording
@@ -18,6 +19,8 @@ from sysid.core.child_processes import limit_resources
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 from sysid.data.value_checks import describe_missing_values, find_infinite_value
+
+_OF_TABLES: Final = ("sample_time", "segments", "columns", "missing")
 
 
 def main() -> int:
@@ -59,11 +62,16 @@ def _convert_file(task: dict[str, Any], options: ReadOptions) -> list[str]:
 
 def read_file(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Recording, list[str]]:
     """Read a file of a kind, and return the notes with its recording."""
+    if kind != "mcap" and options.clock != "log":
+        raise UnreadableFile("the file is no MCAP file, so it has one clock; ", LEAVE_CLOCK)
     if kind == "csv":
         recording, notes = read_csv(path, options)
         return recording, list(notes)
     if kind == "mcap":
-        recording, notes = read_mcap_with_notes(path, options.limits)
+        recording, notes = read_mcap_with_notes(path, options.limits, options.clock)
+        unused = [name for name in _OF_TABLES if name in options.list_given()]
+        if unused:
+            notes = (*notes, f"an MCAP file has times and names; not used: {', '.join(unused)}")
         return recording, [*notes, *_check_finite_values(recording)]
     table, messages = _read_table(path, kind, options)
     return build_recording(table, options, messages), messages

@@ -46,7 +46,7 @@ from service.datasets.dataset_schemas import (
 )
 from service.datasets.stored_recordings import load_recording
 from service.formats.limits import UploadLimits
-from service.formats.read_options import build_options
+from service.formats.read_options import Clock, build_options
 from service.formats.tabular.csv_recordings import generate_csv
 from service.items.item_schemas import DeletedOut, EditIn
 from service.repositories.dataset_rows import DatasetRepository, StoredDataset
@@ -98,6 +98,14 @@ Missing = Annotated[
     ),
 ]
 
+McapClock = Annotated[
+    Clock | None,
+    Query(
+        description="times of an MCAP file: when a message was logged (the default) or sent, or "
+        "the stamp in its header"
+    ),
+]
+
 
 @router.post("/datasets", status_code=201, openapi_extra=UPLOAD_BODY, responses=EXISTING_DATASET)
 async def add_dataset(
@@ -109,6 +117,7 @@ async def add_dataset(
     sample_time: SampleTime = None,
     columns: Columns = None,
     missing: Missing = None,
+    clock: McapClock = None,
 ) -> DatasetOut:
     """Store a recording: CSV or other text, Excel, Parquet, NumPy, MATLAB or MCAP.
 
@@ -132,6 +141,7 @@ async def add_dataset(
                 segments=segments,
                 columns=columns,
                 missing=missing,
+                clock=clock,
                 limits=UploadLimits(
                     file_bytes=settings.max_upload_bytes, memory_bytes=settings.reader_memory_bytes
                 ),
