@@ -19,19 +19,21 @@ SUFFIXES = (
 )
 """Suffixes of files that are read; any text is read whatever its suffix."""
 
+_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_USER_BLOCK = 512  # bytes of MATLAB before those of HDF5
 _MAGICS: tuple[tuple[bytes, FileKind], ...] = (
     (b"\x89MCAP0\r\n", "mcap"),
     (b"PAR1", "parquet"),
     (b"\x93NUMPY", "numpy"),
     (b"MATLAB 5.0 MAT-file", "matlab"),
+    (b"MATLAB 7.3 MAT-file", "matlab"),
     (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "excel"),  # .xls
 )
 _MATLAB_ADVICE = (
     "in MATLAB, save arrays with save('file.mat', 't', 'u', 'y', '-v7'); else export CSV"
 )
 _REFUSED_MAGICS: tuple[tuple[bytes, str, str], ...] = (
-    (b"MATLAB 7.3 MAT-file", "a MATLAB 7.3 file (HDF5)", _MATLAB_ADVICE),
-    (b"\x89HDF\r\n\x1a\n", "an HDF5 file", _MATLAB_ADVICE),
+    (_HDF5_MAGIC, "an HDF5 file without the head of MATLAB", _MATLAB_ADVICE),
     (b"MDF ", "an ASAM MDF file", "export its signals as CSV or as MATLAB arrays"),
     (b"TDSm", "an NI TDMS file", "export its channels as CSV or Excel"),
     (b"ARROW1", "an Arrow (Feather) file", "write the table as Parquet"),
@@ -140,6 +142,11 @@ def _detect_archive_kind(head: bytes) -> FileKind:
     if name.endswith(b".npy"):
         return "numpy"
     raise _build_refusal("a ZIP archive", "unpack it")
+
+
+def is_hdf5(path: Path) -> bool:
+    """Whether a MATLAB file is of version 7.3."""
+    return read_head(path)[_USER_BLOCK:].startswith(_HDF5_MAGIC)
 
 
 def _is_mat4(head: bytes) -> bool:

@@ -88,9 +88,13 @@ def _read_table(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Table
         from service.formats.tabular.json_files import read_json
 
         return read_json(path, options, messages), messages
-    from service.formats.tabular.column_files import read_matlab, read_numpy, read_parquet
+    if kind == "matlab":
+        from service.formats.tabular.matlab_files import read_matlab
 
-    read = {"numpy": read_numpy, "matlab": read_matlab, "parquet": read_parquet}[kind]
+        return read_matlab(path, options, messages), messages
+    from service.formats.tabular.column_files import read_numpy, read_parquet
+
+    read = {"numpy": read_numpy, "parquet": read_parquet}[kind]
     return read(path, options, messages), messages
 
 

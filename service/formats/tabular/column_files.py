@@ -1,4 +1,4 @@
-"""Files of whole columns: arrays of NumPy and MATLAB, and Parquet."""
+"""Files of whole columns: arrays of NumPy, and Parquet."""
 
 import struct
 import zipfile
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 PERIOD_NAMES: Final = ("ts", "dt", "sample_time", "sampletime", "sampling_time", "sample_period")
 RATE_NAMES: Final = ("fs", "sample_rate", "samplerate", "sampling_rate", "sampling_frequency")
-_DAMAGES: Final = (
+DAMAGES: Final = (
     *(ValueError, TypeError, KeyError, IndexError, OSError, EOFError, AttributeError),
     *(NotImplementedError, zlib.error, struct.error, zipfile.BadZipFile),
 )
@@ -50,11 +50,11 @@ def read_numpy(path: Path, options: ReadOptions, notes: list[str]) -> Table:
     """Read the arrays of an ``.npz`` file, or the fields or columns of an ``.npy`` file."""
     try:
         arrays = _read_arrays(path)
-    except _DAMAGES as error:
-        raise _build_damage_error("NumPy", error) from None
+    except DAMAGES as error:
+        raise build_damage_error("NumPy", error) from None
     if "" in arrays:
         arrays = _split_matrix(arrays[""], options)
-    return _build_array_table(arrays, options, notes)
+    return build_array_table(arrays, options, notes)
 
 
 def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -85,60 +85,14 @@ def _split_matrix(matrix: NDArray[Any], options: ReadOptions) -> dict[str, NDArr
     return {f"c{number}": column for number, column in enumerate(matrix.T, 1)}
 
 
-def read_matlab(path: Path, options: ReadOptions, notes: list[str]) -> Table:
-    """Read the arrays of a MATLAB file (version 4 to 7), or the fields of its only structure."""
-    from scipy.io import loadmat, matlab
+def build_array_table(arrays: Mapping[str, Any], options: ReadOptions, notes: list[str]) -> Table:
+    """Build the table of arrays by name; a scalar may be the sampling period.
 
-    try:
-        content = loadmat(path, simplify_cells=True)
-    except (matlab.MatReadError, *_DAMAGES) as error:
-        raise _build_damage_error("MATLAB", error) from None
-    arrays = {str(name): value for name, value in content.items() if not name.startswith("__")}
-    for name, value in arrays.items():
-        if isinstance(value, matlab.MatlabOpaque | matlab.MatlabFunction):
-            what = "an object" if name == "None" else f"the object {name!r}"
-            raise UnreadableFile(
-                f"the MATLAB file holds {what}, such as iddata or timetable, which only MATLAB "
-                "can read. Save its arrays: y = z.y; u = z.u; Ts = z.Ts; save('file.mat', 'y', "
-                "'u', 'Ts', '-v7')"
-            )
-    return _build_array_table(_open_structure(arrays, notes), options, notes)
-
-
-def _open_structure(arrays: Mapping[str, Any], notes: list[str]) -> dict[str, Any]:
-    """Return the arrays, or the fields of the only structure if there are no arrays."""
-    structures = {name: value for name, value in arrays.items() if isinstance(value, Mapping)}
-    plain = {name: value for name, value in arrays.items() if name not in structures}
-    if any(np.size(value) > 1 and _is_signal(np.asarray(value)) for value in plain.values()):
-        if structures:
-            notes.append(f"the structures {', '.join(structures)} were left out")
-        return plain
-    if len(structures) != 1:
-        names = ", ".join(arrays) or "nothing"
-        raise UnreadableFile(
-            f"the file holds {names}; need arrays such as t, u and y, or one structure with them"
-        )
-    ((name, fields),) = structures.items()
-    notes.append(f"the fields of structure {name!r} were read")
-    if "signals" in fields:
-        return _open_simulink(fields)
-    inner = {key: value for key, value in fields.items() if isinstance(value, Mapping)}
-    is_shell = len(inner) == 1 and len(fields) == 1
-    return _open_structure(fields, notes) if is_shell else {**plain, **fields}
-
-
-def _open_simulink(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the signals of Simulink's "structure with time", by their labels."""
-    signals = fields["signals"]
-    arrays = {"time": fields.get("time")}
-    for number, signal in enumerate([signals] if isinstance(signals, Mapping) else signals, 1):
-        label = signal.get("label") if isinstance(signal, Mapping) else None
-        name = label if isinstance(label, str) and label else f"signal{number}"
-        arrays[name] = signal.get("values") if isinstance(signal, Mapping) else signal
-    return arrays
-
-
-def _build_array_table(arrays: Mapping[str, Any], options: ReadOptions, notes: list[str]) -> Table:
+    Raises
+    ------
+    UnreadableFile
+        If there is no signal or no time.
+    """
     columns, left_out = _collect_columns(arrays)
     sample_time = options.sample_time
     names = [name for name, _ in read_headings(options.columns or list(columns))]
@@ -153,7 +107,7 @@ def _build_array_table(arrays: Mapping[str, Any], options: ReadOptions, notes: l
 def _collect_columns(arrays: Mapping[str, Any]) -> tuple[dict[str, ColumnValues], list[str]]:
     """Collect arrays of one length; a matrix gives a column for each of its signals."""
     values = {name: np.asarray(value) for name, value in arrays.items()}
-    signals = {name: array for name, array in values.items() if _is_signal(array)}
+    signals = {name: array for name, array in values.items() if is_signal(array)}
     length = _find_length(signals)
     columns: dict[str, ColumnValues] = {}
     for name, array in signals.items():
@@ -170,7 +124,8 @@ def _collect_columns(arrays: Mapping[str, Any]) -> tuple[dict[str, ColumnValues]
     return columns, left_out
 
 
-def _is_signal(array: NDArray[Any]) -> bool:
+def is_signal(array: NDArray[Any]) -> bool:
+    """Whether an array may hold the samples of a signal."""
     return array.size > 1 and array.ndim in (1, 2) and array.dtype.kind in "fiubMU"
 
 
@@ -219,7 +174,7 @@ def read_parquet(path: Path, options: ReadOptions, notes: list[str]) -> Table:
             )
         frame = scan.collect()
     except pl.exceptions.PolarsError as error:
-        raise _build_damage_error("Parquet", error) from None
+        raise build_damage_error("Parquet", error) from None
     columns: dict[str, ColumnValues] = {}
     in_utc, spans = set(), set()
     for series in frame:
@@ -338,7 +293,8 @@ def _convert_values(
     return numbers
 
 
-def _build_damage_error(kind: str, error: Exception) -> UnreadableFile:
+def build_damage_error(kind: str, error: Exception) -> UnreadableFile:
+    """Return the error of a file that its library cannot read."""
     reason = " ".join(str(error).split())
     if reason.startswith("Object arrays"):
         reason = "an array holds Python objects; write arrays of numbers"

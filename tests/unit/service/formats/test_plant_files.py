@@ -2,14 +2,20 @@
 
 import io
 import json
+import sys
+import warnings
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import h5py
 import numpy as np
+import pandas as pd
 import pytest
 
+from service.formats.file_kinds import detect_kind
 from service.formats.read_options import ReadOptions, build_options
 from service.formats.recordings import read_recording, read_with_notes
+from service.formats.sandbox_child import read_file
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 from tests.support.files.experiment_files import INPUT, OUTPUT, TIMES, join_rows, write_sheet
@@ -397,3 +403,132 @@ def test_files_of_several_loggers_are_joined_on_one_clock(tmp_path: Path) -> Non
     (tmp_path / "bad.csv").write_text("t,u\n0,5 V\n1,2\n")
     with pytest.raises(UnreadableFile, match=r"bad\.csv: row 2, column 'u': found '5 V'"):
         read_with_notes([paths[0], tmp_path / "bad.csv"])
+
+
+def save_matlab(folder: Path, version: str, **content: object) -> Path:
+    with warnings.catch_warnings(action="ignore"):
+        from matio import save_to_mat
+
+        save_to_mat(str(folder / "a.mat"), content, version=version)
+    return folder / "a.mat"
+
+
+def read_here(path: Path) -> Recording:
+    """Read a file as the child does, in this process: a child takes seconds to load pandas."""
+    return read_file(path, detect_kind(path), ReadOptions())[0]
+
+
+def refuse_here(path: Path) -> str:
+    with pytest.raises(UnreadableFile) as caught:
+        read_here(path)
+    return str(caught.value)
+
+
+COLUMNS = {"u": INPUT, "y": OUTPUT}
+SPANS = pd.to_timedelta(np.arange(INPUT.size) * 100, unit="ms")
+
+
+def make_iddata(**changes: object) -> object:
+    """An `iddata` as its properties are stored: matrices, names in cells, period in its unit."""
+    from matio.utils import MatlabOpaque
+
+    properties = {
+        "OutputData_": OUTPUT[:, np.newaxis],
+        "InputData_": INPUT[:, np.newaxis],
+        "Ts": np.array([[0.1]]),
+        "Tstart": np.zeros((0, 0)),
+        "SamplingInstants": np.zeros((0, 0)),
+        "OutputName": np.array([["y"]], dtype=object),
+        "InputName": np.array([["u"]], dtype=object),
+        "OutputUnit": np.array([["degC"]], dtype=object),
+        "TimeUnit": "seconds",
+    }
+    return MatlabOpaque({**properties, **changes}, "iddata")
+
+
+MATLAB = {
+    "arrays": {"t": TIMES, **COLUMNS},
+    "period": {**COLUMNS, "Ts": 0.1},
+    "structure": {"z": {"t": TIMES, **COLUMNS, "name": "rig"}},
+    "nested": {"rig": {"log": {"t": TIMES, **COLUMNS}, "name": "rig"}, "note": "of May"},
+    "spread": {"rig": {"t": TIMES, "in": {"u": INPUT}, "out": {"y": OUTPUT}, "who": "me"}},
+    "table": {"T": pd.DataFrame({"t": TIMES, **COLUMNS})},
+    "timetable": {"TT": pd.DataFrame(COLUMNS, index=SPANS)},
+    "dated timetable": {"TT": pd.DataFrame(COLUMNS, index=pd.Timestamp("2026-03-14") + SPANS)},
+}
+
+
+@pytest.mark.parametrize("version", ["v7", "v7.3"])
+@pytest.mark.parametrize("content", MATLAB.values(), ids=MATLAB)
+def test_matlab_of_every_version_is_read(
+    tmp_path: Path, content: dict[str, object], version: str
+) -> None:
+    recording = read_here(save_matlab(tmp_path, version, **content))
+    assert set(recording.names) == {"u", "y"}
+    for name, values in COLUMNS.items():
+        np.testing.assert_allclose(recording.channel(name).times, TIMES, atol=1e-9)
+        np.testing.assert_array_equal(recording.channel(name).values, values)
+    table = content.get("TT")
+    if isinstance(table, pd.DataFrame) and isinstance(table.index, pd.DatetimeIndex):
+        assert recording.started_at == table.index[0].to_pydatetime()
+
+
+@pytest.mark.parametrize("version", ["v7", "v7.3"])
+def test_an_iddata_has_its_names_units_and_times(tmp_path: Path, version: str) -> None:
+    recording = read_here(save_matlab(tmp_path, version, z=make_iddata()))
+    assert recording.names == ("u", "y")
+    assert recording.channel("y").unit == "degC"
+    np.testing.assert_allclose(recording.channel("y").times, TIMES)
+    np.testing.assert_array_equal(recording.channel("y").values, OUTPUT)
+    minutes = make_iddata(TimeUnit="minutes", Ts=np.array([[0.5]]), Tstart=np.array([[2.0]]))
+    late = read_here(save_matlab(tmp_path, version, z=minutes)).channel("y")
+    np.testing.assert_allclose(late.times, 120 + 30 * np.arange(INPUT.size))
+    uneven = make_iddata(SamplingInstants=(TIMES**1.1)[:, np.newaxis], Ts=np.zeros((0, 0)))
+    times = read_here(save_matlab(tmp_path, version, z=uneven)).channel("y").times
+    np.testing.assert_allclose(times, TIMES**1.1)
+
+
+def test_several_records_of_a_matlab_file_are_refused_by_name(tmp_path: Path) -> None:
+    one = {"t": TIMES, **COLUMNS}
+    error = refuse_here(save_matlab(tmp_path, "v7.3", may=one, june=one))
+    assert "the file holds june, may; need arrays such as t, u and y" in error
+    assert "save('file.mat', '-struct', 'name')" in error
+    cells = np.empty((1, 2), dtype=object)
+    cells[0, 0] = cells[0, 1] = OUTPUT[:, np.newaxis]
+    several = save_matlab(tmp_path, "v7.3", z=make_iddata(OutputData_=cells))
+    assert "holds 2 experiments; save one: z = getexp(z, 1)" in refuse_here(several)
+    whole = save_matlab(tmp_path, "v7.3", **one)
+    whole.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    assert "the MATLAB file cannot be read" in refuse_here(whole)
+
+
+@pytest.mark.parametrize("way", ["link", "values", "virtual"])
+def test_a_matlab_file_reads_no_other_file(tmp_path: Path, way: str) -> None:
+    save_matlab(tmp_path, "v7.3", t=TIMES, u=INPUT)
+    secret = tmp_path / "secret.h5"
+    secret.write_bytes(INPUT.tobytes())
+    with h5py.File(tmp_path / "a.mat", "a") as file:
+        if way == "link":
+            file["y"] = h5py.ExternalLink(str(secret), "/y")
+        elif way == "values":
+            stored = [(str(secret), 0, INPUT.nbytes)]
+            file.create_dataset("y", INPUT.shape, "<f8", external=stored)
+        else:
+            layout = h5py.VirtualLayout(INPUT.shape, "<f8")
+            layout[:] = h5py.VirtualSource(str(secret), "y", shape=INPUT.shape)
+            file.create_virtual_dataset("y", layout)
+    assert "another file" in refuse_here(tmp_path / "a.mat")
+
+
+def test_objects_of_matlab_come_through_the_child(tmp_path: Path) -> None:
+    recording, notes = read_with_notes(save_matlab(tmp_path, "v7.3", z=make_iddata()))
+    np.testing.assert_array_equal(recording.channel("y").values, OUTPUT)
+    assert "the fields of 'z' were read" in notes
+
+
+def test_matlab_without_its_library_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = save_matlab(tmp_path, "v7.3", **COLUMNS)
+    monkeypatch.setitem(sys.modules, "matio", None)
+    assert "pip install 'lagid[matlab]'" in refuse_here(path)

@@ -314,7 +314,7 @@ def test_what_cannot_be_read_is_refused_with_what_to_do(
     ("head", "words"),
     [
         (b"\x89HDF\r\n\x1a\n" + bytes(100), "HDF5"),
-        (b"MATLAB 7.3 MAT-file" + bytes(500), "'-v7'"),
+        (b"MATLAB 7.3 MAT-file" + bytes(500), "the MATLAB file cannot be read"),
         (b"MDF     4.10" + bytes(60), "ASAM MDF"),
         (b"TDSm" + bytes(60), "NI TDMS"),
         (b"PK\x03\x04" + bytes(22) + b"\x05\0\0\0a.csv" + bytes(60), "a ZIP archive"),
