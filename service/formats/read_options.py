@@ -76,8 +76,11 @@ class ReadOptions:
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> "ReadOptions":
         """Return the inverse of `to_document`."""
-        given = {n: tuple(v) if isinstance(v, list) else v for n, v in document.items()}
-        return cls(**given | {"limits": UploadLimits(**document["limits"])})
+        given: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in document.items()
+        }
+        return cls(**{**given, "limits": UploadLimits(**document["limits"])})
 
 
 DEFAULT_OPTIONS: Final = ReadOptions()

@@ -107,10 +107,14 @@ class Heading(NamedTuple):
 
 
 class TimeAxis(NamedTuple):
-    """Times (s), and the moment of time 0 s if it is known; a zone only if the source has one."""
+    """Times (s), and the moment of time 0 s if it is known; a zone only if the source has one.
+
+    `unit` is the unit in which the source has them.
+    """
 
     seconds: FloatArray
     started_at: datetime | None = None
+    unit: str = "s"
 
 
 class DatedAxis(NamedTuple):
@@ -281,7 +285,8 @@ def read_number_times(values: FloatArray, name: str, unit: str, notes: list[str]
             notes.append(
                 f"times were converted from {unit} to s: delays and time constants are in s"
             )
-        return TimeAxis(_scale_times(values, size))
+        name = _LONG_UNITS.get(unit.lower(), unit) if size != 1.0 else "s"
+        return TimeAxis(_scale_times(values, size), unit=name)
     origin = float(values[0])
     shown = f"{origin:.0f}" if origin >= _EXACT_INTEGER else repr(origin)
     shifted = np.round(_scale_times(values - origin, size), _EXACT_DECIMALS if size == 1.0 else 9)

@@ -375,7 +375,9 @@ def _build_own_recording(
             raise content.cut
     channels = tuple(
         _attach_repeats(
-            _attach_history(_build_channel(entry, topics), manifest, topics), manifest, topics
+            _attach_history(_build_channel(entry, topics, manifest.time_unit), manifest, topics),
+            manifest,
+            topics,
         )
         for entry in whole
     )
@@ -393,9 +395,9 @@ def _decode_topic(
     return times, columns
 
 
-def _build_channel(entry: ChannelEntry, topics: _TopicColumns) -> Channel:
+def _build_channel(entry: ChannelEntry, topics: _TopicColumns, time_unit: str) -> Channel:
     times, values = _find_column(f"channel {entry.name!r}", entry.topic, entry.field, topics)
-    return Channel(entry.name, times, values, entry.unit, entry.hold)
+    return Channel(entry.name, times, values, entry.unit, entry.hold, time_unit=time_unit)
 
 
 def _attach_history(channel: Channel, manifest: Manifest, topics: _TopicColumns) -> Channel:

@@ -146,6 +146,7 @@ RESERVED_KEYS = (
     "history",
     "repeats",
     "started_at",
+    "time_unit",
 )
 
 
@@ -255,6 +256,7 @@ def build_manifest(
     entries.sort(key=lambda entry: order.index(entry["name"]))
     clocks = {topic.path: topic.clock.to_dict() for topic in (*topics, *history, *repeats)}
     sampling, start = recording.sampling, recording.started_at
+    time_unit = recording.channels[0].time_unit
     return {
         "format": FORMAT_VERSION,
         "sample_time": f"{sampling.period:.12g}" if sampling.is_regular else "",
@@ -264,6 +266,7 @@ def build_manifest(
         "history": json.dumps(_list_places(history)),
         **({"repeats": json.dumps(_list_places(repeats))} if repeats else {}),
         **({} if start is None else {"started_at": start.isoformat()}),
+        **({} if time_unit == "s" else {"time_unit": time_unit}),
         **metadata,
     }
 
@@ -301,6 +304,7 @@ class Manifest:
     history: Mapping[str, tuple[str, str]]
     repeats: Mapping[str, tuple[str, str]]
     started_at: datetime | None = None
+    time_unit: str = "s"
 
 
 def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
@@ -333,6 +337,7 @@ def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
             history,
             repeats,
             datetime.fromisoformat(metadata["started_at"]) if "started_at" in metadata else None,
+            metadata.get("time_unit", "s"),
         )
     except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise ValueError(f"{type(error).__name__}: {error}") from None

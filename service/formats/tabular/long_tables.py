@@ -147,6 +147,7 @@ def sort_rows(long: LongTable, clock: TimeAxis, starts: IntArray) -> tuple[LongT
     moved = TimeAxis(
         np.round(times[order] - first, 9) if first else times[order],
         start if start is None else start + timedelta(seconds=first),
+        clock.unit,
     )
     values = tuple(column[order] for column in table.values)
     return replace(long, table=replace(table, values=values, rows=table.rows[order])), moved

@@ -109,7 +109,7 @@ def build_recording(table: Table, options: ReadOptions, notes: list[str]) -> Rec
         times, spans = _build_segments(table, labels, times, starts, notes)
     elif is_wide:
         _report_irregular_sampling(times, notes)
-    channels = _build_channels(signals, table, times, options, notes)
+    channels = _build_channels(signals, table, times, clock.unit, options, notes)
     return Recording(channels, spans, clock.started_at)
 
 
@@ -117,6 +117,7 @@ def _build_channels(
     signals: Sequence[Signal],
     table: Table,
     times: FloatArray,
+    time_unit: str,
     options: ReadOptions,
     notes: list[str],
 ) -> tuple[Channel, ...]:
@@ -131,7 +132,8 @@ def _build_channels(
             notes.append(f"channel {signal.name!r}: true and false were read as 1 and 0")
         _report_bad_words(signal.name, table, notes)
         _report_missing_values(signal.name, numbers, table.rows[signal.rows], notes)
-        channels.append(Channel(signal.name, times[signal.rows], numbers, signal.unit or "1"))
+        own = times[signal.rows]
+        channels.append(Channel(signal.name, own, numbers, signal.unit or "1", time_unit=time_unit))
     if not channels:
         raise UnreadableFile("every value is missing; leave the column out", column=empty[0])
     if empty:

@@ -371,3 +371,9 @@ def test_a_recording_of_before_1970_keeps_a_clock_of_its_own() -> None:
     back = read_mcap(write_mcap_bytes(Recording((Channel("u", TIMES, TIMES),), started_at=start)))
     assert back.started_at == start
     np.testing.assert_array_equal(back.channel("u").times, TIMES)
+
+
+def test_the_unit_of_the_times_of_a_source_comes_back() -> None:
+    channel = Channel("u", TIMES, TIMES, time_unit="min")
+    assert read_mcap(write_mcap_bytes(Recording((channel,)))).channel("u").time_unit == "min"
+    assert read_mcap(write_mcap_bytes(two_bases())).channels[0].time_unit == "s"

@@ -18,6 +18,7 @@ from service.formats.recordings import read_recording, read_with_notes
 from service.formats.sandbox_child import read_file
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
+from sysid.data.table_rules import ReadingNote
 from tests.support.files.experiment_files import INPUT, OUTPUT, TIMES, join_rows, write_sheet
 
 BODY = join_rows("t,u,y").partition("\n")[2]
@@ -532,3 +533,12 @@ def test_matlab_without_its_library_says_what_to_install(
     path = save_matlab(tmp_path, "v7.3", **COLUMNS)
     monkeypatch.setitem(sys.modules, "matio", None)
     assert "pip install 'lagid[matlab]'" in refuse_here(path)
+
+
+@pytest.mark.parametrize(("heading", "unit"), [("t [min]", "min"), ("time (h)", "h"), ("t/d", "d")])
+def test_a_channel_knows_the_unit_of_its_times(heading: str, unit: str) -> None:
+    recording, _ = read(join_rows(f"{heading},u,y"))
+    assert {channel.time_unit for channel in recording.channels} == {unit}
+    assert read(join_rows("t,u,y"))[0].channel("u").time_unit == "s"
+    with pytest.warns(ReadingNote, match=f"converted from {unit} to s"):
+        assert Recording({heading: TIMES, "u": INPUT}).channel("u").time_unit == unit
