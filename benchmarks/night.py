@@ -64,6 +64,7 @@ def list_parts(seed: int) -> dict[str, Part]:
         "coverage": program("benchmarks.coverage", "--jobs", "2"),
         "noise models": program("benchmarks.noise_models", "--jobs", "2"),
         "torture": program("benchmarks.torture", "--seed", str(seed)),
+        "soak": program("benchmarks.soak", "--minutes", "240"),  # of each database
         "fuzz": program("benchmarks.fuzz", "--seed", str(seed)),
         "attacks": program("benchmarks.attacks"),
         "libraries": program("benchmarks.dependencies"),

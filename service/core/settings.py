@@ -91,11 +91,12 @@ class Settings(BaseSettings):
     for 60 s, or sends fewer than 500 bytes a second after its first 20 s, is answered by 408."""
     max_uploads: int = Field(default=4, ge=1)
     """Uploads that one web process reads at once, each for at most 120 s, and that a project sends
-    at once. Projects share the places, and one project has all but one at most. Others wait, and
-    are answered by 503 after 20 s."""
+    at once. Simulations of more than two million steps, and derivations of more than two million
+    values, take these places too. Projects share the places, and one project has all but one at
+    most. Others wait, and are answered by 503 after 20 s."""
     reader_memory_mb: int | None = Field(default=None, ge=512)
-    """Memory of the reader of an upload, in MiB. Without it: a share of 60 % of the machine or the
-    container, 4 GiB at most."""
+    """Memory of the reader of an upload, in MiB, and of a child that simulates or derives in its
+    place. Without it: a share of 60 % of the machine or the container, 4 GiB at most."""
     max_connections: int = Field(default=1000, ge=1)
     """Connections of one web process, within its limit of open files. Beyond, one without a request
     makes room, else 503. The head of a request must come within 20 s."""

@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import DatasetNotFound, TooLarge
 from service.core.process import temporary_files
+from service.core.process.concurrency import ReaderPlaces
 from service.core.settings import Settings
 from service.datasets.dataset_schemas import (
     DatasetOut,
@@ -28,6 +29,7 @@ from service.datasets.dataset_schemas import (
     SignalsOut,
     TombstoneOut,
 )
+from service.datasets.large_derivation import derive
 from service.datasets.stored_recordings import load_recording
 from service.formats.file_kinds import SUFFIXES, detect_kind
 from service.formats.mcap.mcap_files import write_recording
@@ -152,7 +154,7 @@ def add_upload(
 
 
 def derive_dataset(
-    database: Database, store: ObjectStore, parent_id: str, body: DeriveIn
+    database: Database, store: ObjectStore, readers: ReaderPlaces, parent_id: str, body: DeriveIn
 ) -> StoredDataset:
     """Derive a dataset from another by steps; the same steps again return the same dataset.
 
@@ -160,17 +162,18 @@ def derive_dataset(
     ------
     DatasetNotFound
         If no dataset has that identifier or name, or several share the name.
-    InvalidRecord, InvalidSettings
-        If a step is not possible.
+    InvalidRecord, InvalidSettings, InvalidRequest
+        If a step is not possible, or needs too much memory or time.
+    ServiceBusy
+        If it is long, and no place became free in time.
     """
     with database.read_session() as session:
         parent = _find_parent(session, parent_id)
         existing = find_existing(session, store, _hash_derivation(parent, body))
     if existing is not None:
         return StoredDataset(existing, is_new=False)
-    from sysid.data.derivations import apply_steps  # brings SciPy's signal processing
-
-    recording, subtracted = apply_steps(load_recording(store, parent.sha256), body.steps)
+    project = database.owner.project_id
+    recording, subtracted = derive(store, parent, body.steps, readers, project)
     steps = ", ".join(next(iter(step), "?") for step in body.steps)
     return add_recording(
         database,
@@ -181,7 +184,7 @@ def derive_dataset(
         key=_hash_derivation(parent, body),
         details={
             "steps": body.steps,
-            "subtracted": [trend._asdict() for trend in subtracted],
+            "subtracted": subtracted,
             "warnings": [],
             "known_before": _measure_history(recording),
         },

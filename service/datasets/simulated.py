@@ -1,7 +1,6 @@
 """Use case: a dataset simulated from a model or a plant, with inputs and noise."""
 
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
-from service.core.process.concurrency import FairPlaces, simulation_places
+from service.core.process.concurrency import ReaderPlaces
 from service.datasets.dataset_schemas import InputIn, SimulateIn
 from service.datasets.datasets import (
     add_recording,
@@ -17,23 +16,19 @@ from service.datasets.datasets import (
     find_existing,
     hash_source,
 )
+from service.datasets.large_simulation import check_finite_outputs, simulate_outputs
 from service.datasets.plants import simulate_plant
 from service.datasets.waveforms import InputSignals
 from service.models import models
-from service.queue.daily_limit import check_budget, count_evaluations
+from service.queue.daily_limit import compute_on_request
 from service.repositories.dataset_rows import StoredDataset, build_dataset_row
 from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
 from sysid.core.errors import InvalidSettings, suggest_name
-from sysid.core.types import FloatArray
-from sysid.data.records import Channel, Recording
+from sysid.data.records import Recording
 from sysid.models.model import DerivedInitial, FixedInitial, Model
 from sysid.models.model_delays import check_delays
-
-LARGE_SAMPLES = 1_000_000
-_large_places = FairPlaces(1, 1, what="simulations of more than a million samples")
-"""One of these at a time: a sample takes some 370 bytes meanwhile (10⁷ of two channels)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +71,9 @@ class SimulatedDataset:
         )
 
 
-def simulate_dataset(database: Database, store: ObjectStore, body: SimulateIn) -> StoredDataset:
+def simulate_dataset(
+    database: Database, store: ObjectStore, readers: ReaderPlaces, body: SimulateIn
+) -> StoredDataset:
     """Simulate a model or a plant as a dataset; the same body returns the same dataset.
 
     Raises
@@ -84,25 +81,17 @@ def simulate_dataset(database: Database, store: ObjectStore, body: SimulateIn) -
     InvalidRequest
         With every fault: unknown model, parameter or signal, a missing value, a bad expression.
     """
-    check_budget(database)
-    project = database.owner.project_id
-    with ExitStack() as places:
-        if (body.samples or 0) > LARGE_SAMPLES:
-            places.enter_context(_large_places.hold(project))
-        places.enter_context(simulation_places.hold(project))
-        if body.plant is not None:
-            made = simulate_plant(database, store, body)
-            count_evaluations(database, 1)
-            return made
-        dataset = simulate_or_find(database, store, body)
-        if isinstance(dataset, StoredDataset):
-            return dataset
-        count_evaluations(database, 1)
-        return dataset.store_dataset(database, store)
+    if body.plant is not None:
+        with compute_on_request(database):
+            return simulate_plant(database, store, body)
+    dataset = simulate_or_find(database, store, readers, body)
+    if isinstance(dataset, StoredDataset):
+        return dataset
+    return dataset.store_dataset(database, store)
 
 
 def simulate_or_find(
-    database: Database, store: ObjectStore, body: SimulateIn
+    database: Database, store: ObjectStore, readers: ReaderPlaces, body: SimulateIn
 ) -> StoredDataset | SimulatedDataset:
     """Simulate a model, or return the existing dataset of the same body; store nothing.
 
@@ -111,6 +100,16 @@ def simulate_or_find(
     InvalidRequest
         As `simulate_dataset`.
     """
+    with compute_on_request(database) as computation:
+        dataset = _simulate_or_find(database, store, readers, body)
+        if isinstance(dataset, StoredDataset):
+            computation.evaluations = 0
+        return dataset
+
+
+def _simulate_or_find(
+    database: Database, store: ObjectStore, readers: ReaderPlaces, body: SimulateIn
+) -> StoredDataset | SimulatedDataset:
     with database.read_session() as session:
         model, document = _resolve_model(session, body.model)
         request = body.model_dump(mode="json", exclude={"name", "plant"})
@@ -141,8 +140,17 @@ def simulate_or_find(
         "true_parameters": body.parameters,
         "warnings": [],
     }
+    outputs = simulate_outputs(
+        model,
+        inputs,
+        _complete_values(model, body),
+        times,
+        readers,
+        database.owner.project_id,
+    ).channels
+    check_finite_outputs(outputs, times)
     return SimulatedDataset(
-        _simulate_recording(model, inputs, body, times),
+        _add_noise(Recording((*inputs, *outputs)), body, [channel.name for channel in outputs]),
         body.name or f"{model.name}, simulated",
         key,
         details,
@@ -158,45 +166,24 @@ def _resolve_model(session: Session, reference: Any) -> tuple[Model, Any]:
     return models.resolve_model(session, reference)
 
 
-def _simulate_recording(
-    model: Model, inputs: list[Channel], body: SimulateIn, times: FloatArray
-) -> Recording:
-    # This import loads the compiler, which most requests never need.
-    from sysid.simulation.simulate import simulate as simulate_model
-
+def _complete_values(model: Model, body: SimulateIn) -> dict[str, float]:
+    """Complete the given values by zero for the states without an initial value."""
     initial_values = {
         f"{state.name}(0)": 0.0
         for state, start in zip(model.states, model.initial, strict=True)
         if not isinstance(start, FixedInitial | DerivedInitial)
     }
-    values = {**initial_values, **body.parameters}
-    outputs = simulate_model(model, inputs, values, times=times).channels
-    check_finite_outputs(outputs, times)
-    recording = Recording((*inputs, *outputs))
+    return {**initial_values, **body.parameters}
+
+
+def _add_noise(recording: Recording, body: SimulateIn, outputs: list[str]) -> Recording:
     if body.noise.sigma == 0:
         return recording
     from sysid.data.derivations import derive_recording
 
-    names = [channel.name for channel in outputs]
-    return derive_recording(recording, [{"noise": {**body.noise.model_dump(), "channels": names}}])
-
-
-def check_finite_outputs(outputs: Sequence[Channel], times: FloatArray) -> None:
-    """Refuse a simulation that diverges.
-
-    Raises
-    ------
-    InvalidRequest
-        With the output and the time.
-    """
-    for channel in outputs:
-        invalid = np.flatnonzero(~np.isfinite(channel.values))
-        if invalid.size:
-            raise InvalidRequest.from_fault(
-                "/parameters",
-                f"with these values output {channel.name!r} diverges at "
-                f"t = {times[invalid[0]]:g} s; choose other values, or a shorter sampling period",
-            )
+    return derive_recording(
+        recording, [{"noise": {**body.noise.model_dump(), "channels": outputs}}]
+    )
 
 
 def check_given_delays(model: Model, values: Mapping[str, float]) -> None:

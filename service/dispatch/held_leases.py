@@ -17,7 +17,6 @@ from service.core.process.loop_watch import LoopWatch
 from service.core.process.process_identity import describe_process
 from service.dispatch.encoding import describe_program
 from service.queue.admission import Admission
-from service.queue.clocks import Clock
 from service.queue.daily_limit import stop_overruns
 from service.queue.dispatchers import (
     CLUSTER_KEY,
@@ -28,6 +27,7 @@ from service.queue.dispatchers import (
 from service.queue.leases import Claim, Lease, LeaseQueue, ProgramOfJob, SizeRule
 from service.queue.notifications import QueueStatus, read_queue_status
 from service.queue.orphaned_jobs import reap_jobs
+from service.storage.clocks import Clock
 from service.storage.columns import Document
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database

@@ -4,7 +4,6 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from importlib.metadata import version
 from itertools import islice
 from typing import Any
@@ -44,7 +43,7 @@ from service.repositories.project_rows import (
 )
 from service.repositories.run_rows import RunRepository
 from service.repositories.search_conditions import NO_FILTER, ListFilter
-from service.storage.columns import utc_now
+from service.storage.clocks import Clock, choose_database_clock
 from service.storage.sessions import Database
 from service.storage.storage_errors import RowNotFound
 from service.storage.tables import Dataset, Job
@@ -78,7 +77,8 @@ def submit_job(
     with database.read_session() as session:
         checked = check_job(session, body, settings)
     with database.write_session() as session:
-        return to_job_out(store_job(session, checked, settings, key).job)
+        job = store_job(session, checked, settings, key).job
+        return to_job_out(job, choose_database_clock(session))
 
 
 def check_job(
@@ -209,13 +209,13 @@ def clone_job(database: Database, job_id: str, settings: Settings) -> JobOut:
 
 def to_job_out(
     job: Job,
+    clock: Clock,
     *,
     with_request: bool = False,
     rms_unit: str | None = None,
     outcome: OutcomeOut | None = None,
-    now: datetime | None = None,
 ) -> JobOut:
-    """Build the answer for a job, as of `now` (by default the present time)."""
+    """Build the answer for a job; its start was told by `clock`, that of the database."""
     return JobOut.from_source(
         job,
         tags=job.tags or [],
@@ -230,7 +230,7 @@ def to_job_out(
         request=job.spec if with_request else None,
         rms_unit=rms_unit,
         outcome=outcome,
-        seconds=measure_seconds(job, now or utc_now()),
+        seconds=measure_seconds(job, clock),
     )
 
 
@@ -238,17 +238,18 @@ def describe_job(session: Session, job: Job) -> JobOut:
     """Build the whole answer for one job, with its request and outcome."""
     return to_job_out(
         job,
+        choose_database_clock(session),
         with_request=True,
         rms_unit=find_rms_unit(session, job.spec),
         outcome=read_outcomes(session, [job]).get(job.id),
     )
 
 
-def measure_seconds(job: Job, now: datetime) -> float | None:
+def measure_seconds(job: Job, clock: Clock) -> float | None:
     """Return the wall time of a job from its first start to its end or to now; None if queued."""
     if job.state is JobState.QUEUED or job.started_at is None:
         return None
-    return max(((job.finished_at or now) - job.started_at).total_seconds(), 0.0)
+    return max(((job.finished_at or clock()) - job.started_at).total_seconds(), 0.0)
 
 
 def list_jobs(
@@ -262,9 +263,11 @@ def list_jobs(
     page = JobRepository(session).list_page(
         cursor=cursor, limit=limit, states=states, chosen=chosen
     )
-    outcomes = read_outcomes(session, page.items)
+    outcomes, clock = read_outcomes(session, page.items), choose_database_clock(session)
     items = [
-        to_job_out(job, rms_unit=find_rms_unit(session, job.spec), outcome=outcomes.get(job.id))
+        to_job_out(
+            job, clock, rms_unit=find_rms_unit(session, job.spec), outcome=outcomes.get(job.id)
+        )
         for job in page.items
     ]
     return JobPage(items=items, next=page.next)

@@ -8,19 +8,26 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from service.core.errors import Conflict
+from service.core.errors import BudgetExceeded, Conflict
 from service.datasets.stored_recordings import load_recording
 from service.formats.mcap.mcap_files import FitRole, FittedOutput
 from service.jobs.stored_run import StoredRun
 from service.repositories.run_rows import RunRepository
 from service.runs.bands import load_bands
+from service.runs.disturbances import load_disturbances
 from service.runs.fitted import load_fitted_signals
 from service.runs.residuals import analyse_residuals
 from service.storage.objects import ObjectStore
 from service.storage.storage_errors import ObjectMissing, RowNotFound
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
-from sysid.figures.data import ExperimentTraces, OutputTraces, SearchTraces, SignalTrace
+from sysid.figures.data import (
+    DisturbanceTraces,
+    ExperimentTraces,
+    OutputTraces,
+    SearchTraces,
+    SignalTrace,
+)
 from sysid.models.parameters import Parameter
 from sysid.results.figures import (
     RecordTraces,
@@ -29,6 +36,7 @@ from sysid.results.figures import (
     arrange_experiments,
     label_fitness,
     list_searched_parameters,
+    to_disturbance_traces,
     to_signal_trace,
 )
 from sysid.results.result import Result
@@ -91,8 +99,17 @@ class StoredRunFigures:
             return experiments
         try:
             return add_bands(experiments, load_bands(session, store, stored))
-        except Conflict:  # no standard errors, or a dataset was deleted
+        except (BudgetExceeded, Conflict):  # no evaluations left, no standard errors, no dataset
             return experiments
+
+    @cached_property
+    def disturbances(self) -> Sequence[DisturbanceTraces]:
+        """The estimated disturbances; empty where they cannot be computed."""
+        try:
+            records = load_disturbances(self.session, self.store, self.stored)
+        except Conflict:  # no standard errors, or a dataset was deleted
+            return []
+        return to_disturbance_traces(records)
 
     @cached_property
     def residuals(self) -> TestedResiduals | None:

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pprint import pformat
 from typing import Any
 from urllib.parse import urlencode
@@ -11,7 +10,6 @@ from urllib.parse import urlencode
 from sqlalchemy.orm import Session
 
 from service.core.states import JobState
-from service.datasets.rms_unit import find_rms_unit
 from service.figures.noise_figure import noise_group_keys, noise_sweep_height
 from service.formats.file_kinds import SUFFIXES
 from service.items.items import compute_etag
@@ -151,12 +149,8 @@ def jobs_page(session: Session, selection: JobSelection, cursor: str | None, bas
         chosen=selection.chosen,
         order=selection.order,
     )
-    now = datetime.now(UTC)
     outcomes = read_outcomes(session, page.items)
-    jobs = [
-        to_job_view(job, find_rms_unit(session, job.spec), now, outcomes.get(job.id))
-        for job in page.items
-    ]
+    jobs = [to_job_view(session, job, outcomes.get(job.id)) for job in page.items]
     typed = dict(selection.form)
     stateless = {name: text for name, text in typed.items() if name != "state"}
     return render_template(
@@ -224,7 +218,7 @@ def job_page(
     )
     chosen = runs.get(run_id) if run_id else _find_best_run(runs, job)
     stored = StoredRun.from_rows(job, chosen) if chosen else None
-    view = to_job_view(job, find_rms_unit(session, job.spec), datetime.now(UTC))
+    view = to_job_view(session, job)
     return render_template(
         "job.html",
         job=view,
@@ -378,11 +372,18 @@ def load_full_run(session: Session, store: ObjectStore, stored: StoredRun) -> Ru
         sampled = () if result.posterior is None else result.posterior.parameters
         heights |= {
             "correlation": correlation_height(len(names)) if result.correlation else 0,
+            "disturbances": _disturbances_height(result),
             "residuals": _residuals_height(result) if has_signals else 0,
             "waterfall": WATERFALL_HEIGHT if result.islands else 0,
             "posterior": posterior_height(len(sampled)) if sampled else 0,
         }
     return to_run_view(stored, result, stored.rms_unit(session), heights)
+
+
+def _disturbances_height(result: Result) -> int:
+    sources = () if result.plant_noise is None else result.plant_noise.sources
+    inside = sum(source.kind != "sensor" for source in sources)
+    return signal_figures.disturbance_height(inside) if inside else 0
 
 
 def _residuals_height(result: Result) -> int:

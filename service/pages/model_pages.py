@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import cache
 from typing import Any
 
@@ -10,7 +9,6 @@ import yaml
 from markupsafe import Markup
 from sqlalchemy.orm import Session
 
-from service.datasets.rms_unit import find_rms_unit
 from service.items.items import compute_etag
 from service.jobs.outcomes import read_outcomes
 from service.models import models
@@ -126,7 +124,7 @@ def model_page(session: Session, reference: str) -> str:
     jobs = JobRepository(session).list_page(
         limit=JOBS_SHOWN, chosen=ListFilter(terms=(("model", model.name),))
     )
-    now, outcomes = datetime.now(UTC), read_outcomes(session, jobs.items)
+    outcomes = read_outcomes(session, jobs.items)
     row = None if model.builtin else repository.get(reference)
     return render_template(
         "model.html",
@@ -135,10 +133,7 @@ def model_page(session: Session, reference: str) -> str:
         etag="" if row is None else compute_etag(row),
         versions=[] if row is None else [one.version for one in repository.list_versions(row.name)],
         text=_to_yaml(model.document),
-        jobs=[
-            to_job_view(job, find_rms_unit(session, job.spec), now, outcomes.get(job.id))
-            for job in jobs.items
-        ],
+        jobs=[to_job_view(session, job, outcomes.get(job.id)) for job in jobs.items],
         has_more_jobs=jobs.next is not None,
         datasets=DatasetRepository(session).list_page(limit=DATASETS_OFFERED).items,
     )

@@ -1,13 +1,11 @@
 """Pages of accepted references: their list, and what is compared with each."""
 
 from collections.abc import Iterable, Mapping
-from datetime import UTC, datetime
 from urllib.parse import urlencode
 
 from sqlalchemy.orm import Session
 
 from service.core.label_text import format_labels
-from service.datasets.rms_unit import find_rms_unit
 from service.items.items import compute_etag
 from service.jobs.outcomes import read_outcomes
 from service.jobs.references import get_reference, list_references
@@ -78,7 +76,7 @@ def reference_page(session: Session, name: str) -> str:
     runs = [reference.run, *(one.run for one in reference.history)]
     uses = _list_uses(LineageRepository(session).list_links_to_children(runs))
     ids = sorted(uses, reverse=True)
-    jobs, now = JobRepository(session).list_some(ids[:JOBS_SHOWN]), datetime.now(UTC)
+    jobs = JobRepository(session).list_some(ids[:JOBS_SHOWN])
     outcomes = read_outcomes(session, jobs)
     return render_template(
         "accepted_reference.html",
@@ -88,10 +86,7 @@ def reference_page(session: Session, name: str) -> str:
         title=f"{stored.model.name}, {stored.job.name}",
         labels=format_labels(reference.labels),
         estimates=stored.estimates,
-        jobs=[
-            to_job_view(job, find_rms_unit(session, job.spec), now, outcomes.get(job.id))
-            for job in jobs
-        ],
+        jobs=[to_job_view(session, job, outcomes.get(job.id)) for job in jobs],
         uses=uses,
         flags=count_trend_flags(session, jobs),
         unlisted=len(ids) - len(ids[:JOBS_SHOWN]),

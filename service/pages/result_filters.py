@@ -24,7 +24,7 @@ from sysid.models.model import Model
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import ResidualTest
 from sysid.results.findings import Finding, list_untold_reasons
-from sysid.results.parts import OrderComparison, OrderFit
+from sysid.results.parts import NoiseSource, OrderComparison, OrderFit
 from sysid.results.result import Result
 from sysid.results.summary import describe_search
 from sysid.uncertainty.estimates import Estimate, PosteriorParameter
@@ -208,6 +208,11 @@ def format_excess_bic(fit: OrderFit, comparison: OrderComparison) -> str:
     return format_criterion(fit.bic - lowest if isfinite(fit.bic) else None)
 
 
+def describe_noise_kind(source: NoiseSource) -> str:
+    """Describe what a source of noise is."""
+    return {"sensor": "sensor", "load": "slow load", "plant": "diffusion of a state"}[source.kind]
+
+
 def list_equations(model: Model) -> list[str]:
     """List the equations of a model as MathML."""
     return [equation.mathml for equation in format_equations(model)]
@@ -234,5 +239,6 @@ RESULT_FILTERS = {
     "told_orders": select_told_orders,
     "delay_text": format_delay_text,
     "excess_bic": format_excess_bic,
+    "noise_text": describe_noise_kind,
     "equations": list_equations,
 }

@@ -71,6 +71,8 @@ def load_run_figure(
     run = StoredRunFigures(session, store, load_run(session, run_id))
     if name == "response" and run.experiments:
         _check_experiment(choice.experiment, len(run.experiments))
+    elif name == "disturbances" and run.disturbances:
+        _check_experiment(choice.experiment, len(run.disturbances))
     elif name == "residuals" and run.residuals is not None:
         _check_experiment(choice.experiment, len(run.residuals.experiments))
     look = FigureLook(choice.abscissa, choice.columns, choice.start, choice.stop)

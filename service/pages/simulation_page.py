@@ -21,6 +21,7 @@ from service.core.errors import (
     Unavailable,
     to_field_errors,
 )
+from service.core.process.concurrency import ReaderPlaces
 from service.figures.csv import to_csv
 from service.figures.embed import strip_template, templates_json, to_script_json
 from service.figures.simulation_figure import apply_units, begin_near_step, plot_simulation
@@ -116,7 +117,12 @@ class SimulationAnswer:
 
 
 def simulate_page(
-    database: Database, store: ObjectStore, run_id: str, query: Mapping[str, str], base_url: str
+    database: Database,
+    store: ObjectStore,
+    readers: ReaderPlaces,
+    run_id: str,
+    query: Mapping[str, str],
+    base_url: str,
 ) -> SimulationAnswer:
     """Render the form, and the simulation if the query requests one.
 
@@ -135,7 +141,7 @@ def simulate_page(
         kind = read_kind(query)
         if has_request(query):
             wanted = parse_query(form.model, query)
-            figure, context = _simulate_query(database, store, form, wanted)
+            figure, context = _simulate_query(database, store, readers, form, wanted)
             if query.get("format") == "csv":
                 return SimulationAnswer(to_csv(figure), is_csv=True)
             if wanted.kind == "loop":
@@ -280,7 +286,11 @@ def _round_text(value: float) -> str:
 
 
 def _simulate_query(
-    database: Database, store: ObjectStore, form: _FormContext, wanted: SimulationQuery
+    database: Database,
+    store: ObjectStore,
+    readers: ReaderPlaces,
+    form: _FormContext,
+    wanted: SimulationQuery,
 ) -> tuple[Figure, dict[str, Any]]:
     if wanted.kind == "recording":
         body = _validate_body(FreeRunIn, wanted.body)
@@ -292,7 +302,7 @@ def _simulate_query(
             "records": MAX_LISTED_RECORDS,
         }
     body = _validate_body(RunSimulationIn, wanted.body)
-    simulation = run_simulation.simulate_run(database, store, form.run, body, MAX_POINTS)
+    simulation = run_simulation.simulate_run(database, store, readers, form.run, body, MAX_POINTS)
     with_units = apply_units(simulation, form.units)
     since = wanted.body["control"]["reference"]["time"] if wanted.kind == "loop" else None
     entered = form.units.get(wanted.body["control"]["input"], "1") if since is not None else "1"

@@ -6,15 +6,19 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
+from sqlalchemy.orm import Session
+
 from service.core.bodies.job_fields import DATASETS_PATH
 from service.core.bodies.wire import Answer
 from service.core.label_text import format_count, format_value
 from service.core.states import OPEN_STATES, JobState, RunStateName, describe_state
+from service.datasets.rms_unit import find_rms_unit
 from service.items.items import compute_etag
 from service.jobs.job_schemas import JobOut, OutcomeOut
 from service.jobs.outcomes import is_batch
 from service.jobs.stored_run import StoredRun
 from service.jobs.submit import to_job_out
+from service.storage.clocks import choose_database_clock
 from service.storage.tables import Event, Job
 from sysid.results.result import Result
 
@@ -140,9 +144,15 @@ class EventView:
     text: str
 
 
-def to_job_view(job: Job, unit: str, now: datetime, outcome: OutcomeOut | None = None) -> JobView:
-    """Build the view of a job; `unit` is the unit of its RMS."""
-    document = to_job_out(job, with_request=True, rms_unit=unit, outcome=outcome, now=now)
+def to_job_view(session: Session, job: Job, outcome: OutcomeOut | None = None) -> JobView:
+    """Build the view of a job."""
+    document = to_job_out(
+        job,
+        choose_database_clock(session),
+        with_request=True,
+        rms_unit=find_rms_unit(session, job.spec),
+        outcome=outcome,
+    )
     return JobView.from_source(document, lost_leases=job.lost_leases, max_attempts=job.max_attempts)
 
 

@@ -2,14 +2,17 @@
 
 A submission is refused at once. But what a job will cost is not known before, so each dispatcher
 looks with its heartbeat. A stopped job keeps its results and checkpoints, and can be resumed.
-What a web process computes on request counts too, whatever the scope of the key.
+What a web process computes on request, or to show a run, counts too, whatever the scope of the key.
 """
 
 import logging
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 
 from sqlalchemy.exc import OperationalError
 
+from service.core.process.concurrency import simulation_places
 from service.repositories.job_rows import JobRepository
 from service.repositories.project_rows import (
     add_requested_work,
@@ -46,8 +49,35 @@ def check_budget(database: Database) -> None:
 
 def count_evaluations(database: Database, evaluations: int) -> None:
     """Count what a request has computed."""
+    if not evaluations:
+        return
     with suppress(OperationalError), database.write_session(NOTE_BUSY_SECONDS) as session:
         add_requested_work(session, evaluations)
+
+
+@dataclass(slots=True)
+class Computation:
+    """What a request computes: its `evaluations`, one simulation by default."""
+
+    evaluations: int = 1
+
+
+@contextmanager
+def compute_on_request(database: Database) -> Iterator[Computation]:
+    """Hold a place for simulations during the block, and count what it has computed.
+
+    Raises
+    ------
+    BudgetExceeded
+        If the project has used up its evaluations of a day.
+    ServiceBusy
+        If no place became free in time.
+    """
+    check_budget(database)
+    computation = Computation()
+    with simulation_places.hold(database.owner.project_id):
+        yield computation
+    count_evaluations(database, computation.evaluations)
 
 
 def stop_overruns(database: Database, busy_seconds: float | None = None) -> list[str]:

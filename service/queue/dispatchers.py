@@ -7,7 +7,7 @@ from typing import Literal
 from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
-from service.queue.clocks import Clock, choose_database_clock
+from service.storage.clocks import Clock, choose_database_clock
 from service.storage.columns import Document
 from service.storage.statements import upsert
 from service.storage.tables import DispatcherHeartbeat

@@ -36,9 +36,9 @@ from sqlalchemy.orm import Session, defer
 
 from service.core.states import OPEN_STATES, JobState
 from service.queue.admission import Admission, count_running_jobs, is_open
-from service.queue.clocks import Clock, choose_database_clock
 from service.repositories.event_rows import EventKind, EventRepository
 from service.repositories.job_rows import end_job, end_open_runs, lock_parcels, notify_queue
+from service.storage.clocks import Clock, choose_database_clock
 from service.storage.columns import Document, UtcDateTime
 from service.storage.statements import RETURNING_OPTIONS
 from service.storage.storage_errors import LeaseLost, RowConflict

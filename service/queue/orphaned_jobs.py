@@ -12,9 +12,9 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.core.process import service_metrics
 from service.core.process.process_identity import is_awake, is_gone
-from service.queue.clocks import Clock
 from service.queue.dispatchers import DispatcherRepository, find_lease_length
 from service.queue.leases import HUNG_AFTER, LeaseOwners, LeaseQueue, ReapResult
+from service.storage.clocks import Clock
 from service.storage.sessions import Database
 
 _log = logging.getLogger(__name__)

@@ -10,7 +10,6 @@ from sqlalchemy import Connection, Select, delete, event, func, select, update
 from sqlalchemy.orm import Session
 
 from service.core.states import OPEN_STATES, JobState
-from service.queue.clocks import Clock
 from service.queue.leases import FinalState, Lease, LeaseQueue, LockedParcel, choose_smaller_rms
 from service.queue.packed_results import (
     COPY_END,
@@ -29,6 +28,7 @@ from service.repositories.history_rows import (
     pack_history,
     pack_migrants,
 )
+from service.storage.clocks import Clock
 from service.storage.columns import Document, UtcDateTime, to_json, utc_now
 from service.storage.statements import (
     CHUNK_ROWS,

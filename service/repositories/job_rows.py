@@ -15,6 +15,7 @@ from service.repositories.event_rows import EventRepository
 from service.repositories.outcome_rows import record_best_run
 from service.repositories.project_rows import DAY
 from service.repositories.search_conditions import NO_FILTER, ListFilter, select_ids, select_matches
+from service.storage.clocks import choose_database_clock
 from service.storage.columns import Document, utc_now
 from service.storage.sessions import find_project
 from service.storage.statements import (
@@ -79,6 +80,7 @@ class JobRepository:
 
     def __init__(self, session: Session, project_id: str | None = None) -> None:
         self._session, self._project_id = session, project_id or find_project(session)
+        self._clock = choose_database_clock(session)
 
     def submit(self, new: NewJob, *, key: str | None = None, request_hash: str = "") -> Submission:
         """Queue a job; with a `key` that was used before, return the earlier job.
@@ -234,7 +236,7 @@ class JobRepository:
         if not job.cancel_requested:  # else the first who asked has told why
             job.cancel_requested, job.error = True, reason
         if job.state is JobState.QUEUED:
-            end_job(self._session, job, JobState.CANCELLED, None, utc_now())
+            end_job(self._session, job, JobState.CANCELLED, None, self._clock())
         record_action(self._session, "job.cancel", job_id, self._project_id)
         self._session.flush()
         return job
@@ -264,7 +266,7 @@ class JobRepository:
             chosen.values(state=JobState.QUEUED, error=None, finished_at=None, kills=0),
             execution_options=RETURNING_OPTIONS,
         )
-        if job.finished_at is not None and job.finished_at <= utc_now() - DAY:
+        if job.finished_at is not None and job.finished_at <= self._clock() - DAY:
             job.evaluations_before = job.evaluations
         job.state, job.cancel_requested = JobState.QUEUED, False
         job.error = job.finished_at = job.fit_estimation = job.trust = None
@@ -432,7 +434,7 @@ def end_open_runs(
     if numbers is not None:
         unfinished = unfinished.where(Run.number >= numbers.start, Run.number < numbers.stop)
     session.execute(
-        unfinished.values(state=state, error=error, finished_at=utc_now()),
+        unfinished.values(state=state, error=error, finished_at=choose_database_clock(session)()),
         execution_options=RETURNING_OPTIONS,
     )
 

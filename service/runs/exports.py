@@ -18,6 +18,8 @@ from sysid.core.errors import InvalidSettings
 from sysid.core.text import find_shown_error
 from sysid.core.value_documents import encode, list_fields
 from sysid.export.export import ExportFormat, write_export
+from sysid.export.observer import build_observer
+from sysid.models.kalman_filter import is_noise_parameter
 from sysid.results.result import Result
 from sysid.uncertainty.estimates import Estimate
 
@@ -56,7 +58,10 @@ def export_run(session: Session, run_id: str, format: ExportFormat, pade_order: 
     """
     stored = load_estimated_run(session, run_id, "export")
     try:
-        text = write_export(_build_identified(session, stored), format, pade_order)
+        identified = _build_identified(session, stored)
+        assert stored.result is not None  # only an identified model is exported
+        observer = build_observer(identified, stored.result)
+        text = write_export(identified, format, pade_order, observer)
     except NotLinear as error:
         raise InvalidRequest.from_fault(
             "?format", f"{format!r} is not possible: {error}"
@@ -146,7 +151,8 @@ def _read_datasets(session: Session, body: JobBody) -> list[Dataset]:
 
 def _read_values(stored: StoredRun) -> Iterator[IdentifiedValue]:
     for one in stored.estimates:
-        yield IdentifiedValue(one.name, one.value, one.unit, one.stderr, one.status)
+        if not is_noise_parameter(one.name):
+            yield IdentifiedValue(one.name, one.value, one.unit, one.stderr, one.status)
 
 
 def _compute_covariance(result: Result, values: tuple[IdentifiedValue, ...]) -> Covariance | None:
@@ -155,8 +161,11 @@ def _compute_covariance(result: Result, values: tuple[IdentifiedValue, ...]) -> 
         return None
     correlation = result.correlation
     errors = {value.name: np.nan if value.stderr is None else value.stderr for value in values}
-    deviations = np.array([errors[name] for name in correlation.names], dtype=np.float64)
-    return Covariance(correlation.names, correlation.matrix * np.outer(deviations, deviations))
+    rows = [i for i, name in enumerate(correlation.names) if name in errors]  # not those of noise
+    names = tuple(correlation.names[i] for i in rows)
+    deviations = np.array([errors[name] for name in names], dtype=np.float64)
+    matrix = correlation.matrix[np.ix_(rows, rows)] * np.outer(deviations, deviations)
+    return Covariance(names, matrix)
 
 
 def _find_channels(

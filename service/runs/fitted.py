@@ -16,9 +16,10 @@ from service.formats.mcap.mcap_files import (
     read_fitted_outputs,
 )
 from service.jobs.stored_run import StoredRun, load_run
+from service.queue.daily_limit import count_evaluations
 from service.runs.run_schemas import ExperimentOut, ResponseOut
 from service.storage.objects import ObjectStore
-from service.storage.sessions import find_project, release_connection
+from service.storage.sessions import find_database, find_project, release_connection
 from service.storage.storage_errors import ObjectDamaged, ObjectMissing, RowNotFound
 from sysid.core.errors import SysidError, UnreadableFile
 from sysid.data.records import Channel
@@ -33,7 +34,8 @@ def load_fitted_signals(
 ) -> tuple[FittedOutput, ...] | None:
     """Load the measured and simulated outputs of a run; None if it has not succeeded.
 
-    Signals that were not stored are computed again.
+    Signals that were not stored are computed again. That counts as one evaluation, but is not
+    refused if none are left: a project sees what it has.
 
     Raises
     ------
@@ -80,6 +82,7 @@ def _compute_signals(
                 f"the signals of run {stored.run.id} are not stored, and cannot be computed "
                 f"again: {error}"
             ) from error
+    count_evaluations(find_database(session), 1)
     fits = list_fitted_outputs("estimation", records.estimation, signals.simulated)
     if records.validation is not None:
         validated = signals.simulated_validation

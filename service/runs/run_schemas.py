@@ -152,6 +152,36 @@ class BandsOut(Answer):
     experiments: list[BandExperimentOut] = Field(description="records of the run")
 
 
+class DisturbanceOut(Answer):
+    """An estimated disturbance with its 95 % band, in `unit`; null where the filter diverged."""
+
+    place: str = Field(description="input or output with a load, or state that noise moves")
+    kind: Literal["load", "plant"] = Field(description="a load, or a state of the plant itself")
+    unit: str = Field(description="unit of all values")
+    samples: int = Field(description="times before the reduction")
+    times: list[float] = Field(description="times, s")
+    values: list[float | None] = Field(description="estimate from the whole record")
+    lower: list[float | None] = Field(description="lower end of the band")
+    upper: list[float | None] = Field(description="upper end of the band")
+
+
+class DisturbanceExperimentOut(Answer):
+    """Disturbances of one record."""
+
+    name: str = Field(description="name of the record")
+    disturbances: list[DisturbanceOut] = Field(description="disturbance at each place")
+
+
+class DisturbancesOut(Answer):
+    """Estimated disturbances of a run with noise inside the plant; without it there are no records.
+
+    Each time is estimated from the whole record, and the band holds at each time by itself.
+    """
+
+    id: str = Field(description="identifier of the run")
+    experiments: list[DisturbanceExperimentOut] = Field(description="records of the run")
+
+
 @extend_by(ResidualTest)
 class CorrelationOut(Answer):
     """Correlation function of residuals with its bands, and its test.

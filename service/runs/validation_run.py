@@ -13,12 +13,11 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
-from service.core.process.concurrency import simulation_places
 from service.datasets.datasets import to_series
 from service.datasets.signal_channels import SignalChannels, map_channels
 from service.datasets.stored_recordings import read_records
 from service.jobs.stored_run import StoredRun, load_estimated_run
-from service.queue.daily_limit import check_budget, count_evaluations
+from service.queue.daily_limit import compute_on_request
 from service.repositories.dataset_rows import DatasetRepository
 from service.runs.run_schemas import AgreementOut, ExperimentOut, FreeRunIn, FreeRunOut
 from service.storage.objects import ObjectStore
@@ -90,13 +89,10 @@ def simulate_free_run(
     database: Database, store: ObjectStore, run_id: str, body: FreeRunIn
 ) -> FreeRun:
     """Simulate as `validate_run` does, but return arrays. Raises the same errors."""
-    check_budget(database)
-    with simulation_places.hold(database.owner.project_id):
+    with compute_on_request(database):
         with database.read_session() as session:
             problem, row = _read_problem(session, store, run_id, body)
-        free_run = _evaluate_free_run(problem, run_id, row)
-    count_evaluations(database, 1)
-    return free_run
+        return _evaluate_free_run(problem, run_id, row)
 
 
 def _read_problem(

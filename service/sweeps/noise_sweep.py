@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest, to_field_errors
+from service.core.process.concurrency import ReaderPlaces
 from service.core.settings import Settings
 from service.datasets.dataset_schemas import SimulateIn
 from service.datasets.simulated import SimulatedDataset, simulate_or_find
@@ -61,6 +62,7 @@ class _SweepBase(NamedTuple):
 def submit_noise_sweep(
     database: Database,
     store: ObjectStore,
+    readers: ReaderPlaces,
     settings: Settings,
     body: NoiseSweepIn,
     key: str | None = None,
@@ -76,7 +78,7 @@ def submit_noise_sweep(
     KeyReused
         If the idempotency key was used with another body.
     """
-    source = _prepare_source(database, store, body)
+    source = _prepare_source(database, store, readers, body)
     try:
         with database.read_session() as session:
             plain = _build_base(session, body, source, settings.max_runs_per_job)
@@ -107,12 +109,14 @@ def _grid_faults(body: NoiseSweepIn, most_runs: int) -> Iterator[FieldError]:
         )
 
 
-def _prepare_source(database: Database, store: ObjectStore, body: NoiseSweepIn) -> _RecordSource:
+def _prepare_source(
+    database: Database, store: ObjectStore, readers: ReaderPlaces, body: NoiseSweepIn
+) -> _RecordSource:
     if body.truth is None:
         return _RecordSource(list(body.datasets or ()))
     document = {"model": body.model, **body.truth.model_dump()}
     try:
-        simulation = simulate_or_find(database, store, SimulateIn.model_validate(document))
+        simulation = simulate_or_find(database, store, readers, SimulateIn.model_validate(document))
     except (InvalidModel, UnknownModel) as error:
         of_model = (fault_in_job(body.model, fault) for fault in to_field_errors(error))
         return _RecordSource([UNSTORED_ID], faults=tuple(of_model))

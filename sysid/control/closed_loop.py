@@ -80,13 +80,15 @@ class ClosedLoop:
         times : FloatArray, shape (N,)
             Times of the outputs in s.
         """
+        values = self.complete_values(inputs, values, times)
+        return simulate(self.model, inputs, values, times=times)
+
+    def complete_values(
+        self, inputs: Sequence[Channel], values: Mapping[str, float], times: FloatArray
+    ) -> dict[str, float]:
+        """Complete the plant's values to those of `model`, for the arguments of `simulate`."""
         loop_values = self.rename_values(values)
-        return simulate(
-            self.model,
-            inputs,
-            self._compute_filter_start(inputs, loop_values, times) | loop_values,
-            times=times,
-        )
+        return self._compute_filter_start(inputs, loop_values, times) | loop_values
 
     def _compute_filter_start(
         self, inputs: Sequence[Channel], values: Mapping[str, float], times: FloatArray

@@ -7,6 +7,7 @@ such as a `numpy.py`, would then be run instead of the real one.
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from math import ceil
 from pathlib import Path
 
@@ -17,6 +18,8 @@ OUT_OF_PROCESSOR_TIME = -24
 _ROOT = str(Path(__file__).resolve().parents[2])
 # Variables that an interpreter may need to start. Children get no secret of this process.
 _INHERITED_VARIABLES = ("PATH", "LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH")
+CODE_CACHE_VARIABLES = ("LAGID_CACHE_DIR", "NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME")
+"""Where compiled code is, for children that run it (`sysid.core.code_cache`)."""
 
 
 def build_child_command(module: str, *arguments: str) -> list[str]:
@@ -42,18 +45,29 @@ def build_import_path() -> str:
 
 
 def run_child(
-    module: str, task: bytes, *, seconds: float, folder: str = SAFE_FOLDER
+    module: str,
+    task: bytes,
+    *,
+    seconds: float,
+    folder: str = SAFE_FOLDER,
+    variables: Sequence[str] = (),
 ) -> "subprocess.CompletedProcess[bytes]":
     """Run a module of this package on one task: its input, for at most `seconds` of wall time.
 
     The module limits itself by `limit_resources`.
+
+    Parameters
+    ----------
+    variables : sequence of str
+        Environment variables that the child inherits besides those of its interpreter.
 
     Raises
     ------
     subprocess.TimeoutExpired
         If it takes longer.
     """
-    inherited = {name: os.environ[name] for name in _INHERITED_VARIABLES if name in os.environ}
+    names = (*_INHERITED_VARIABLES, *variables)
+    inherited = {name: os.environ[name] for name in names if name in os.environ}
     return subprocess.run(
         build_child_command(module),
         cwd=folder,

@@ -41,6 +41,7 @@ _SOURCE_PATTERNS = (
     "islands/*.py",
     "kernels/**/*.py",
     "simulation/*.py",
+    "uncertainty/disturbances.py",
     "uncertainty/local_algebra.py",
     "uncertainty/sensitivities.py",
     "residuals/restricted_likelihood.py",

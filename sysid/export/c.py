@@ -1,7 +1,7 @@
 """Export as self-contained C99: parameters in a struct, one function that simulates."""
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from string import Template
 from typing import ClassVar
@@ -11,6 +11,12 @@ from sysid.data.interpolation import MAX_POINTS_PER_STEP
 from sysid.export.description import describe_model, describe_unit, describe_values, wrap_source
 from sysid.export.expression_text import TargetLanguage, write_expression, write_number
 from sysid.export.identifiers import Identifiers, escape_c_comment
+from sysid.export.observer import (
+    Observer,
+    list_used_lines,
+    list_window_arrays,
+    pair_arguments,
+)
 from sysid.export.program import (
     GeneratedProgram,
     LoopScope,
@@ -22,7 +28,7 @@ from sysid.export.program import (
 )
 from sysid.language.functions import FUNCTIONS, Level
 from sysid.language.time_switches import HALVINGS
-from sysid.models.model import MeasuredInitial
+from sysid.models.model import MeasuredInitial, ModelSignal, Output
 from sysid.simulation.grid import GRID_TOLERANCE
 
 _RESERVED_WORDS = (
@@ -91,7 +97,7 @@ class CLanguage(TargetLanguage):
         """Write a time lag that is at most 1e9 steps."""
         return f"fmin({delay}, 1e9)"
 
-    def open_loop(self, index: str, first: int, *, to_last: bool) -> str:
+    def open_loop(self, index: str, first: str, *, to_last: bool) -> str:
         """Write the first line of a loop over the steps."""
         return (
             f"for (long {index} = {first}; {index} {'<=' if to_last else '<'} steps; ++{index}) {{"
@@ -121,8 +127,10 @@ class CLanguage(TargetLanguage):
         return ["    begin = behind;", "}"]
 
 
-def write_c_source(identified: IdentifiedModel) -> str:
+def write_c_source(identified: IdentifiedModel, observer: Observer | None = None) -> str:
     """Write a C99 file: ``NAME_parameters``, ``NAME_identified`` and ``NAME_simulate``.
+
+    An observer adds ``NAME_observer`` and its functions ``start``, ``advance`` and ``correct``.
 
     Raises
     ------
@@ -130,11 +138,9 @@ def write_c_source(identified: IdentifiedModel) -> str:
         If a value is missing.
     """
     language = CLanguage()
-    names = Identifiers(
-        [*_RESERVED_WORDS.split(), *(function.c for function in FUNCTIONS.values())]
-    )
+    names = _make_identifiers()
     stem = names.make_identifier(identified.model.name)
-    for suffix in ("parameters", "identified", "sides", "switch", "simulate"):
+    for suffix in ("parameters", "identified", "sides", "switch", "simulate", "observer"):
         names.make_identifier(f"{stem}_{suffix}")
     program = GeneratedProgram(identified, language, names, prefix="p->", stem=stem)
     loop = [*time_loop(program, _write_runge_kutta), *_write_outputs(program)]
@@ -148,9 +154,21 @@ def write_c_source(identified: IdentifiedModel) -> str:
         "return 0;",
     ]
     switches = _write_switches(program)
+    filtered = ""
+    if observer is not None:
+        own = GeneratedProgram(
+            observer.identified,
+            language,
+            _make_identifiers("o", "factor", "innovation", "change"),
+            prefix="p->",
+            stem=f"{stem}_observer",
+            first_step=f"steps - {observer.substeps}",
+        )
+        filtered = _write_observer(own, observer)
+        program.helper_names |= own.helper_names
     helpers = list_needed_helpers(HELPERS, program)
     parts = [
-        _write_header(identified, stem),
+        _write_header(identified, stem, has_observer=observer is not None),
         "#include <math.h>\n#include <stdlib.h>\n",
         _write_struct(program, stem),
         _write_identified_function(program, stem),
@@ -161,17 +179,26 @@ def write_c_source(identified: IdentifiedModel) -> str:
         "{",
         *indent_lines(body),
         "}",
+        *(["", filtered] if filtered else []),
     ]
     return "\n".join(parts) + "\n"
 
 
-def _write_header(identified: IdentifiedModel, stem: str) -> str:
+def _make_identifiers(*reserved: str) -> Identifiers:
+    """Make the identifiers of a program, without the words of C and those that are `reserved`."""
+    functions = (function.c for function in FUNCTIONS.values())
+    return Identifiers([*_RESERVED_WORDS.split(), *functions, *reserved])
+
+
+def _write_header(identified: IdentifiedModel, stem: str, *, has_observer: bool) -> str:
     lines = [
         *describe_model(identified),
         "",
         f"{stem}_identified() returns the identified values.",
         f"{stem}_simulate() runs the model freely; link with -lm.",
     ]
+    if has_observer:
+        lines.append(f"{stem}_observer filters samples as they come; its functions are at the end.")
     comment = "\n".join(f" * {escape_c_comment(line)}".rstrip() for line in lines)
     return f"/*\n{comment}\n */"
 
@@ -274,6 +301,12 @@ def _write_step_count(program: GeneratedProgram) -> list[str]:
         ]
         if program.find_step_lengths():
             lines.append("const double ratio = dt/sample_time;")
+    return [*lines, *_write_input_lengths(program), f"(void){period};"]
+
+
+def _write_input_lengths(program: GeneratedProgram) -> list[str]:
+    """Write the lengths that the reads of inputs need."""
+    lines = []
     needed = program.find_step_lengths()
     if needed & {"ramp", "width"}:
         lines.append(
@@ -295,7 +328,7 @@ def _write_step_count(program: GeneratedProgram) -> list[str]:
         ]
     if "half" in needed:
         lines.append(f"const double half = {program.write_half_step()}; /* samples: half a step */")
-    return [*lines, f"(void){period};"]
+    return lines
 
 
 def _write_delays(program: GeneratedProgram) -> list[str]:
@@ -352,7 +385,8 @@ def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
             *program.language.close_parts(),
             *(f"{one}[step + 1] = {place};" for place, one in zip(now, arrays, strict=True)),
         ]
-    return ["for (long step = 0; step < steps; ++step) {", *indent_lines(body), "}"]
+    head = program.language.open_loop("step", program.first_step, to_last=False)
+    return [head, *indent_lines(body), *program.language.close_loop()]
 
 
 def _write_stages(
@@ -453,6 +487,145 @@ def _write_interpolated_outputs(program: GeneratedProgram) -> list[str]:
             "    free(grid);",
             "}",
         ]
+    return lines
+
+
+# ---- the observer ---------------------------------------------------------------------------
+def _write_observer(program: GeneratedProgram, observer: Observer) -> str:
+    """Write ``STEM_start``, ``STEM_advance`` and ``STEM_correct``."""
+    stem = program.stem
+    now = [f"double {argument}" for _, argument in pair_arguments(program, program.input_names)]
+    compared = [
+        f"double {argument}, double *{program.name_argument(name, 'predicted')}"
+        for name, argument in pair_arguments(program, program.output_names)
+    ]
+    functions = {
+        "start": (now, _write_window_start(program, observer)),
+        "advance": (
+            now,
+            [*_move_window(program, observer), *time_loop(program, _write_runge_kutta)],
+        ),
+        "correct": (compared, _write_corrections(program, observer)),
+    }
+    names = [*_name_observer_parts(program, observer), ("step", "const long step = steps;")]
+    parts = [
+        _write_observer_comment(program, observer),
+        _write_struct(program, stem),
+        _write_identified_function(program, stem),
+        _write_window(program, observer),
+    ]
+    for name, (signals, body) in functions.items():
+        arguments = [f"{stem} *o", f"const {stem}_parameters *p", *signals]
+        known = names if name == "correct" else names[:-1]  # the others count their steps
+        written = [*list_used_lines(known, body), *body]
+        used = any("p->" in line for line in written)
+        parts += [
+            f"void {stem}_{name}(",
+            *indent_lines(textwrap.wrap(", ".join(arguments), _LINE_WIDTH - 8)),
+            ")",
+            "{",
+            *indent_lines([*written, *([] if used else ["(void)p;"])]),
+            "}",
+            "",
+        ]
+    return "\n".join(parts[:-1])
+
+
+def _name_observer_parts(
+    program: GeneratedProgram, observer: Observer
+) -> Iterator[tuple[str, str]]:
+    """Name what the functions of an observer may use: lengths, arrays, delays."""
+    yield "sample_time", f"const double sample_time = {write_number(observer.sample_time)};"
+    yield "dt", f"const double dt = sample_time/{write_number(observer.substeps)};"
+    yield "n", f"const long n = {observer.samples};"
+    yield "steps", f"const long steps = {observer.steps};"
+    for line in _write_input_lengths(program):
+        yield line.split(" = ")[0].split()[-1], line
+    for name in [*program.input_names.values(), *list_window_arrays(program)]:
+        yield name, f"double *const {name} = o->{name};"
+    for delay, name in program.delay_names.items():
+        steps = write_delay_steps(program, delay)
+        yield name, f"const double {name} = {steps}; /* integration steps */"
+
+
+def _write_observer_comment(program: GeneratedProgram, observer: Observer) -> str:
+    identified, stem = observer.identified, program.stem
+    lines = [
+        f"Observer (Kalman filter) for samples each {observer.sample_time:.10g} s.",
+        f"{stem}_start() begins at the first sample, with the inputs there.",
+        f"{stem}_correct() predicts the outputs of a sample from those before, and then corrects",
+        "the states by what was measured; NAN: not measured.",
+        f"{stem}_advance() goes on to the next sample, with the inputs there. Without a correction",
+        "it predicts further ahead; a copy of the struct keeps the present.",
+        f"Time lags may be up to {observer.longest_lag:.6g} s.",
+    ]
+    signals: tuple[ModelSignal | Output, ...] = identified.model.inputs
+    names = {**program.input_names, **program.output_names}
+    for signal in (*signals, *identified.model.outputs):
+        unit = describe_unit(identified.get_unit(signal))
+        lines.append(f"{names[signal.name]}: {signal.name}, {unit}.")
+    return "/*\n" + "\n".join(f" * {escape_c_comment(line)}" for line in lines) + "\n */"
+
+
+def _write_window(program: GeneratedProgram, observer: Observer) -> str:
+    lines = ["typedef struct { /* the last element of each array is that of the present */"]
+    lines += [f"    double {name}[{observer.samples}];" for name in program.input_names.values()]
+    lines += [f"    double {name}[{observer.steps + 1}];" for name in list_window_arrays(program)]
+    return "\n".join([*lines, f"}} {program.stem};", ""])
+
+
+def _write_window_start(program: GeneratedProgram, observer: Observer) -> list[str]:
+    model = observer.identified.model
+    lines = ["for (long i = 0; i < n; ++i) {"]
+    arguments = pair_arguments(program, program.input_names)
+    lines += [f"    {name}[i] = {argument};" for name, argument in arguments]
+    lines += ["}", "for (long i = 0; i <= steps; ++i) {"]
+    before = "i < steps ? 0.0 : " if model.solver.history == "zero" else ""
+    for i, state in enumerate(model.states):
+        name = program.array_names[state.name]
+        lines += indent_lines(_wrap_statement(f"{name}[i] = ", f"{before}{program.write_start(i)}"))
+    rises = list_window_arrays(program)[len(model.states) :]
+    return [*lines, *(f"    {name}[i] = 0.0;" for name in rises), "}"]
+
+
+def _move_window(program: GeneratedProgram, observer: Observer) -> list[str]:
+    substeps, arguments = observer.substeps, pair_arguments(program, program.input_names)
+    lines = ["for (long i = 1; i < n; ++i) {"]
+    lines += [f"    {name}[i - 1] = {name}[i];" for name, _ in arguments]
+    lines += ["}", *(f"{name}[n - 1] = {argument};" for name, argument in arguments)]
+    lines.append(f"for (long i = {substeps}; i <= steps; ++i) {{")
+    arrays = list_window_arrays(program)
+    return [*lines, *(f"    {name}[i - {substeps}] = {name}[i];" for name in arrays), "}"]
+
+
+def _write_corrections(program: GeneratedProgram, observer: Observer) -> list[str]:
+    """Write the outputs one after the other; each corrects the states before the next is predicted.
+
+    All changes of an output follow from the states before it.
+    """
+    model, language = observer.identified.model, program.language
+    scope = LoopScope(program, "output")
+    lines: list[str] = []
+    arguments = pair_arguments(program, program.output_names)
+    for (name, argument), output, correction in zip(
+        arguments, model.outputs, model.corrections, strict=True
+    ):
+        predicted = f"*{program.name_argument(name, 'predicted')}"
+        text = write_expression(output.expression, language, scope)
+        lines += _wrap_statement(f"{predicted} = ", text)
+        own = write_expression(correction.variance, language, scope)
+        sensor = write_number(observer.sensors[output.name])
+        pairs = [*correction.gains, *correction.losses]
+        changes = [write_expression(tree, language, scope) for _, tree in pairs]
+        body = _wrap_statement("const double factor = ", f"1.0/({sensor} + {own})")
+        body.append(f"const double innovation = {argument} - {predicted};")
+        body.append(f"double change[{len(pairs)}];")
+        for i, text in enumerate(changes):
+            body += _wrap_statement(f"change[{i}] = ", text)
+        for i, (state, _) in enumerate(pairs):
+            by = "factor*innovation" if i < len(correction.gains) else "-factor"
+            body.append(f"{program.array_names[state]}[step] += {by}*change[{i}];")
+        lines += [f"if (!isnan({argument})) {{", *indent_lines(body), "}"]
     return lines
 
 

@@ -11,6 +11,7 @@ from sysid.core.errors import InvalidSettings, suggest_name
 from sysid.data.records import Hold
 from sysid.export.c import write_c_source
 from sysid.export.description import write_json_source
+from sysid.export.observer import Observer, build_observer
 from sysid.export.python import write_python_source
 from sysid.export.python_control import write_control_source
 from sysid.language.evaluation import evaluate_expression
@@ -27,8 +28,7 @@ EXPORT_FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
 MAX_PADE_ORDER = 20
 _HOLDS: tuple[Hold, ...] = get_args(Hold)
 
-_WRITERS: Mapping[str, Callable[[IdentifiedModel], str]] = {
-    "json": write_json_source,
+_WRITERS: Mapping[str, Callable[[IdentifiedModel, Observer | None], str]] = {
     "python": write_python_source,
     "c": write_c_source,
 }
@@ -93,11 +93,17 @@ def export_model(
     identified = IdentifiedModel(
         model, values, covariance, sample_time, holds, version, dict(provenance or {}), units
     )
-    return write_export(identified, format, pade_order)
+    observer = build_observer(identified, result) if isinstance(result, Identification) else None
+    return write_export(identified, format, pade_order, observer)
 
 
-def write_export(identified: IdentifiedModel, format: str, pade_order: int = 3) -> str:
-    """Write an identified model in one of `EXPORT_FORMATS`.
+def write_export(
+    identified: IdentifiedModel,
+    format: str,
+    pade_order: int = 3,
+    observer: Observer | None = None,
+) -> str:
+    """Write an identified model in one of `EXPORT_FORMATS`; programs have an observer too.
 
     Raises
     ------
@@ -117,7 +123,9 @@ def write_export(identified: IdentifiedModel, format: str, pade_order: int = 3) 
         raise InvalidSettings("/model/terms", "the terms are not selected yet; there is no model")
     if format == "control":
         return write_control_source(identified, pade_order)
-    return _WRITERS[format](identified)
+    if format == "json":
+        return write_json_source(identified)
+    return _WRITERS[format](identified, observer)
 
 
 def _collect_values(

@@ -86,7 +86,7 @@ class TargetLanguage(Protocol):
     def write_limit(self, delay: str) -> str:
         """Write a time lag that is at most 1e9 steps, so that its whole part is a number."""
 
-    def open_loop(self, index: str, first: int, *, to_last: bool) -> str:
+    def open_loop(self, index: str, first: str, *, to_last: bool) -> str:
         """Write the first line of a loop over steps from `first`; `to_last` includes the last."""
 
     def assign(self, name: str, text: str, *, is_new: bool = False) -> list[str]:

@@ -40,7 +40,10 @@ EvaluationStage = Literal["slope", "update", "recursion", "output"]
 
 @dataclass(slots=True)
 class GeneratedProgram:
-    """Identifiers of a program; `delay_names` and `helper_names` grow as it is written."""
+    """Identifiers of a program; `delay_names` and `helper_names` grow as it is written.
+
+    `first_step` is that of the loop over integration steps.
+    """
 
     identified: IdentifiedModel
     language: TargetLanguage
@@ -57,6 +60,8 @@ class GeneratedProgram:
     rise_names: dict[str, tuple[str, str]] = field(default_factory=dict)
     delay_names: dict[Expression, str] = field(default_factory=dict)
     helper_names: set[str] = field(default_factory=set)
+    argument_names: dict[tuple[str, str], str] = field(default_factory=dict)
+    first_step: str = "0"
 
     def __post_init__(self) -> None:
         model, make_identifier = self.identified.model, self.identifiers.make_identifier
@@ -202,6 +207,13 @@ class GeneratedProgram:
                 f"delay_{len(self.delay_names) + 1}"
             )
         return self.delay_names[expression]
+
+    def name_argument(self, signal: str, role: str) -> str:
+        """Name an argument of one sample of a signal: ``u_now``."""
+        if (signal, role) not in self.argument_names:
+            name = self.identifiers.make_identifier(f"{signal}_{role}")
+            self.argument_names[signal, role] = name
+        return self.argument_names[signal, role]
 
     def write_ramp_width(self) -> str:
         """Write half the width of a held input's jump, in samples, as in `FineInput`."""
@@ -463,7 +475,7 @@ def _write_recursion(program: GeneratedProgram) -> list[str]:
         now = program.present_names[name]
         body += language.assign(now, equation(program, "recursion", i), is_new=True)
         body += language.assign(f"{program.array_names[name]}[k]", now)
-    head = language.open_loop("k", program.n_start_samples, to_last=True)
+    head = language.open_loop("k", str(program.n_start_samples), to_last=True)
     return [head, *indent_lines(body), *language.close_loop()]
 
 
@@ -488,7 +500,7 @@ def _write_euler(program: GeneratedProgram) -> list[str]:
         arrays = [program.array_names[state.name] for state in model.states]
         copies = [language.assign(f"{name}[step + 1]", f"{name}[step]") for name in arrays]
         body = [*chain.from_iterable(copies), *parts]
-    head = language.open_loop("step", 0, to_last=False)
+    head = language.open_loop("step", program.first_step, to_last=False)
     return [head, *indent_lines(body), *language.close_loop()]
 
 

@@ -1,7 +1,7 @@
 """Export as a Python module of one function that needs nothing but NumPy."""
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -10,6 +10,12 @@ from sysid.data.interpolation import MAX_POINTS_PER_STEP
 from sysid.export.description import describe_model, describe_unit, describe_values, wrap_source
 from sysid.export.expression_text import TargetLanguage, write_expression, write_number
 from sysid.export.identifiers import Identifiers, escape_docstring
+from sysid.export.observer import (
+    Observer,
+    list_used_lines,
+    list_window_arrays,
+    pair_arguments,
+)
 from sysid.export.program import (
     GeneratedProgram,
     LoopScope,
@@ -90,9 +96,9 @@ class PythonLanguage(TargetLanguage):
         """Write a time lag that is at most 1e9 steps."""
         return f"min({delay}, 1e9)"
 
-    def open_loop(self, index: str, first: int, *, to_last: bool) -> str:
+    def open_loop(self, index: str, first: str, *, to_last: bool) -> str:
         """Write the first line of a loop over the steps."""
-        ends = f"{first}, " if first else ""
+        ends = f"{first}, " if first != "0" else ""
         return f"for {index} in range({ends}steps{' + 1' if to_last else ''}):"
 
     def assign(self, name: str, text: str, *, is_new: bool = False) -> list[str]:
@@ -117,8 +123,10 @@ class PythonLanguage(TargetLanguage):
         return ["    begin, number = behind, number + 1"]
 
 
-def write_python_source(identified: IdentifiedModel) -> str:
+def write_python_source(identified: IdentifiedModel, observer: Observer | None = None) -> str:
     """Write a module with one function ``simulate(t, u, …) -> y``.
+
+    An observer adds a class ``Observer``.
 
     Raises
     ------
@@ -138,6 +146,26 @@ def write_python_source(identified: IdentifiedModel) -> str:
         *_write_delays(program),
         *_write_starts(program),
     ]
+    filtered: list[str] = []
+    if observer is not None:
+        own = GeneratedProgram(
+            observer.identified,
+            language,
+            Identifiers(
+                [
+                    *_RESERVED_WORDS.split(),
+                    "self",
+                    "factor",
+                    "innovation",
+                    "change",
+                    "array",
+                    "states",
+                ]
+            ),
+            first_step=f"steps - {observer.substeps}",
+        )
+        filtered = _write_observer(own, observer)
+        program.helper_names |= own.helper_names
     helpers = list_needed_helpers(HELPERS, program)
     body = [*head, 'with np.errstate(all="ignore"):  # what diverges becomes inf or nan']
     body += indent_lines(loop)
@@ -146,9 +174,10 @@ def write_python_source(identified: IdentifiedModel) -> str:
         ("import math\n\n" if "erf" in language.called_functions else "") + "import numpy as np\n",
         *(f"\n{helper}" for helper in helpers),
     ]
-    parts.append("\n" + _write_signature(program))
+    arguments = ["t", *program.input_names.values()]
+    parts.append("\n" + _write_signature(program, "simulate", arguments))
     parts += [textwrap.indent("\n".join(_write_function_docstring(program)), "    ")]
-    parts += [textwrap.indent("\n".join(body), "    ")]
+    parts += [textwrap.indent("\n".join(body), "    "), *filtered]
     return "\n".join(parts) + "\n"
 
 
@@ -157,7 +186,8 @@ def _write_docstring(identified: IdentifiedModel) -> str:
     return "\n".join(['"""' + lines[0], "", *lines[1:], '"""', ""])
 
 
-def _write_signature(program: GeneratedProgram) -> str:
+def _write_signature(program: GeneratedProgram, name: str, first: Sequence[str]) -> str:
+    """Write the head of a function: its first arguments, then starts and parameters as keywords."""
     identified = program.identified
     numbers = identified.parameter_values
     required = [
@@ -175,8 +205,8 @@ def _write_signature(program: GeneratedProgram) -> str:
         if (start := program.find_initial_value(i)) is not None
     ]
     named = [*required, *defaults, *starts]
-    arguments = ["t", *program.input_names.values(), *(["*"] if named else []), *named]
-    return "def simulate(\n" + _wrap_lines(", ".join(arguments) + ",", "    ") + "\n):"
+    arguments = [*first, *(["*"] if named else []), *named]
+    return f"def {name}(\n" + _wrap_lines(", ".join(arguments) + ",", "    ") + "\n):"
 
 
 def _write_function_docstring(program: GeneratedProgram) -> list[str]:
@@ -302,7 +332,7 @@ def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
         *slopes,
         "    ])",
         "",
-        "for step in range(steps):",
+        program.language.open_loop("step", program.first_step, to_last=False),
         f"    now = np.array([{now}])",
     ]
     if program.sides:
@@ -389,6 +419,156 @@ def _write_outputs(program: GeneratedProgram) -> list[str]:
         ]
         if program.grid_step is not None:
             lines.append(f"{target} = np.interp(grid, np.arange(points + 1), {target})")
+    return [*lines, f"return {', '.join(program.output_names.values())}"]
+
+
+# ---- the observer ---------------------------------------------------------------------------
+def _write_observer(program: GeneratedProgram, observer: Observer) -> list[str]:
+    """Write the class ``Observer`` with its methods ``advance`` and ``correct``."""
+    inputs, outputs = (
+        [argument for _, argument in pair_arguments(program, names)]
+        for names in (program.input_names, program.output_names)
+    )
+    loop = [
+        *_move_window(program, observer),
+        'with np.errstate(all="ignore"):',
+        *indent_lines(time_loop(program, _write_runge_kutta)),
+    ]
+    corrections = _write_corrections(program, observer)
+    names = list(_name_observer_parts(program, observer))
+    present = [*names, ("step", "step = steps")]
+    start = _write_window_start(program, observer)
+    before = [(name, line) for name, line in names if " = self." not in line]
+    return [
+        "",
+        "",
+        "class Observer:",
+        *indent_lines(_write_observer_docstring(program, observer)),
+        "",
+        *indent_lines([_write_signature(program, "__init__", ["self", *inputs])]),
+        *indent_lines([*list_used_lines(before, start), *start], 2),
+        "",
+        f"    def advance({', '.join(['self', *inputs])}):",
+        '        """Go on to the next sample, with the inputs there."""',
+        *indent_lines([*list_used_lines(names, loop), *loop], 2),
+        "",
+        f"    def correct({', '.join(['self', *outputs])}):",
+        '        """Predict the outputs now, then correct the states by what was measured."""',
+        *indent_lines([*list_used_lines(present, corrections), *corrections], 2),
+    ]
+
+
+def _write_observer_docstring(program: GeneratedProgram, observer: Observer) -> list[str]:
+    model = observer.identified.model
+    lines = [
+        '"""Observer (Kalman filter): predictions of the outputs from the samples before.',
+        "",
+        f"Samples are {observer.sample_time:.10g} s apart. It begins at the first one, with the "
+        "inputs there.",
+        "`correct` returns what is predicted for the present sample, and then takes what was",
+        "measured; nan: not measured. Without it `advance` predicts further ahead, on a copy",
+        f"(copy.deepcopy) if need be. Time lags may be up to {observer.longest_lag:.6g} s.",
+        "`states` has the arrays of the last steps; the last element of each is the present one.",
+        "",
+        "Parameters",
+        "----------",
+    ]
+    for signal in model.inputs:
+        unit = describe_unit(program.identified.get_unit(signal))
+        argument = program.name_argument(program.input_names[signal.name], "now")
+        lines += [f"{argument} : float", f"    {signal.name}, {unit}."]
+    for name, line in describe_values(
+        program.identified, program.parameter_names, program.start_names
+    ):
+        lines += [f"{name} : float", f"    {line}"]
+    return [lines[0], *map(_escape_line, lines[1:]), '"""']
+
+
+def _name_observer_parts(
+    program: GeneratedProgram, observer: Observer
+) -> Iterator[tuple[str, str]]:
+    """Name what the methods of an observer may use: lengths, parameters, arrays, delays."""
+    parameters = [*program.parameter_names.values()]
+    yield from ((name, f"{name} = self.parameters[{i}]") for i, name in enumerate(parameters))
+    yield "sample_time", f"sample_time = {write_number(observer.sample_time)}"
+    yield "dt", f"dt = sample_time/{observer.substeps}"
+    yield "steps", f"steps = {observer.steps}"
+    if "half" in program.find_step_lengths():
+        yield "half", f"half = {program.write_half_step()}  # samples: half an integration step"
+    if "ramp" in program.find_step_lengths():
+        yield "ramp", f"ramp = {program.write_ramp_width()}  # samples: half the width of a jump"
+    for i, name in enumerate(program.input_names.values()):
+        yield name, f"{name} = self.inputs[{i}]"
+    for i, name in enumerate(list_window_arrays(program)):
+        yield name, f"{name} = self.states[{i}]"
+    for delay, name in program.delay_names.items():
+        yield name, f"{name} = {write_delay_steps(program, delay)}  # integration steps"
+
+
+def _write_window_start(program: GeneratedProgram, observer: Observer) -> list[str]:
+    model, inputs = observer.identified.model, [*program.input_names.values()]
+    parameters, lines = [*program.parameter_names.values()], list[str]()
+    if parameters:
+        targets = _wrap_lines(", ".join(parameters) + ",", "    ")
+        lines += ["self.parameters = tuple(map(np.float64, (", targets, ")))"]
+    lines += [
+        f"{name} = np.full({observer.samples}, {argument}, np.float64)"
+        for name, argument in pair_arguments(program, program.input_names)
+    ]
+    for i, state in enumerate(model.states):
+        name = program.array_names[state.name]
+        lines += _wrap_statement(
+            f"{name} = np.full(steps + 1, ", program.write_start(i), ", np.float64)"
+        )
+        if model.solver.history == "zero":
+            lines.append(f"{name}[:-1] = 0.0")
+    arrays = list_window_arrays(program)
+    lines += [f"{name} = np.zeros(steps + 1)" for name in arrays[len(model.states) :]]
+    return [
+        *lines,
+        f"self.inputs = [{', '.join(inputs)}]",
+        *_wrap_statement("self.states = ", f"[{', '.join(arrays)}]"),
+    ]
+
+
+def _move_window(program: GeneratedProgram, observer: Observer) -> list[str]:
+    substeps = observer.substeps
+    lines = []
+    for i, (_, argument) in enumerate(pair_arguments(program, program.input_names)):
+        window = f"self.inputs[{i}]"
+        lines += [f"{window}[:-1] = {window}[1:]", f"{window}[-1] = {argument}"]
+    return [
+        *lines,
+        "for array in self.states:",
+        f"    array[:-{substeps}] = array[{substeps}:]",
+    ]
+
+
+def _write_corrections(program: GeneratedProgram, observer: Observer) -> list[str]:
+    """Write the outputs one after the other; each corrects the states before the next is predicted.
+
+    All changes of an output follow from the states before it.
+    """
+    model, language = observer.identified.model, program.language
+    scope = LoopScope(program, "output")
+    lines: list[str] = []
+    arguments = pair_arguments(program, program.output_names)
+    for (name, argument), output, correction in zip(
+        arguments, model.outputs, model.corrections, strict=True
+    ):
+        lines += _wrap_statement(f"{name} = ", write_expression(output.expression, language, scope))
+        own = write_expression(correction.variance, language, scope)
+        sensor = write_number(observer.sensors[output.name])
+        pairs = [*correction.gains, *correction.losses]
+        body = _wrap_statement("factor = ", f"1.0/({sensor} + {own})")
+        body += [f"innovation = {argument} - {name}", "change = np.array(["]
+        for _, tree in pairs:
+            body += indent_lines(_wrap_statement("", write_expression(tree, language, scope), ","))
+        body.append("])")
+        for i, (state, _) in enumerate(pairs):
+            by = "factor*innovation" if i < len(correction.gains) else "-factor"
+            body.append(f"{program.array_names[state]}[step] += {by}*change[{i}]")
+        lines += [f"if not np.isnan({argument}):", *indent_lines(body)]
     return [*lines, f"return {', '.join(program.output_names.values())}"]
 
 

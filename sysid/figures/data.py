@@ -60,6 +60,14 @@ class ExperimentTraces:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class DisturbanceTraces:
+    """The estimated disturbances of one record, each with the ends (N, 2) of its 95 % band."""
+
+    name: str
+    disturbances: tuple[tuple[SignalTrace, Floats], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CorrelationTrace:
     """A correlation function of residuals over lags, with its bands.
 

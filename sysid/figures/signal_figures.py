@@ -8,7 +8,13 @@ import numpy as np
 
 from sysid.core.text import bracket_unit, plain_unit
 from sysid.figures import theme
-from sysid.figures.data import ExperimentTraces, Floats, OutputTraces, SignalTrace
+from sysid.figures.data import (
+    DisturbanceTraces,
+    ExperimentTraces,
+    Floats,
+    OutputTraces,
+    SignalTrace,
+)
 from sysid.figures.plotly import MARGIN, Figure, base_layout, to_json_numbers
 from sysid.figures.theme import MAX_POINTS, thin_indices, window_slice
 
@@ -16,6 +22,7 @@ T = TypeVar("T")
 _GAP_PX = 20
 _HISTORY_FRACTION = 0.1  # drawn input history before the record, as a share of its duration
 _OUTPUT_PX, _RESIDUAL_PX, _INPUT_PX, _SIGNAL_PX = 240, 84, 110, 120
+_DISTURBANCE_PX = 180
 
 
 def plot_response(
@@ -249,6 +256,29 @@ def plot_signals(
     return figure
 
 
+def plot_disturbances(
+    record: DisturbanceTraces, start: float | None = None, stop: float | None = None
+) -> Figure:
+    """Draw the estimated disturbances of a record with their bands, one below the other."""
+    figure = stack_plots([_DISTURBANCE_PX] * len(record.disturbances))
+    for number, (signal, band) in enumerate(record.disturbances, 1):
+        span, axis = window_slice(signal.times, start, stop), f"y{number}"
+        figure["data"] += _draw_band(
+            "95 % band", signal, band, span, axis, opacity=0.3, in_legend=number == 1
+        )
+        line = signal_line(signal, span, axis, theme.BLUE, legend=number == 1)
+        figure["data"].append({**line, "name": "estimate"})
+        name_axis(figure, number, f"{signal.name}{bracket_unit(signal.unit)}")
+    thinned = _is_thinned([signal for signal, _ in record.disturbances])
+    figure["layout"].update(uirevision=record.name, meta={"thinned": thinned})
+    return figure
+
+
+def disturbance_height(count: int) -> int:
+    """Compute the height (px) of so many disturbances, so that a page can reserve its room."""
+    return _stack_height([_DISTURBANCE_PX] * count)
+
+
 def _response_heights(n_outputs: int, n_inputs: int) -> list[int]:
     return [_OUTPUT_PX, _RESIDUAL_PX] * n_outputs + [_INPUT_PX] * n_inputs
 
@@ -341,22 +371,43 @@ def _band_traces(
     """Draw the bands below the lines, the wider one first."""
     if output.bands is None:
         return []
-    shown = thin_indices(output.identified[span], MAX_POINTS)
-    shared = {"type": "scatter", "yaxis": axis_id(axis), "showlegend": in_legend}
-    x = to_json_numbers(output.measured.times[span][shown])
-    traces = []
-    for name, ends, opacity in (
-        ("95 % prediction band", output.bands.prediction, 0.14),
-        ("95 % confidence band", output.bands.confidence, 0.4),
-    ):
-        low, high = (to_json_numbers(end) for end in ends[span][shown].T)
-        edge = {**shared, "mode": "lines", "x": x, "line": {"width": 0}, "hoverinfo": "skip"}
-        area = {"fill": "tonexty", "fillcolor": theme.fade(theme.BLUE, opacity)}
-        traces += [
-            {**edge, "name": f"{name}, lower end", "y": low, "showlegend": False},
-            {**edge, "name": name, "y": high, **area},
-        ]
-    return traces
+    identified = replace(output.measured, values=output.identified)
+    wider, narrower = (
+        _draw_band(name, identified, ends, span, axis, opacity=opacity, in_legend=in_legend)
+        for name, ends, opacity in (
+            ("95 % prediction band", output.bands.prediction, 0.14),
+            ("95 % confidence band", output.bands.confidence, 0.4),
+        )
+    )
+    return [*wider, *narrower]
+
+
+def _draw_band(
+    name: str,
+    signal: SignalTrace,
+    ends: Floats,
+    span: slice,
+    axis: str,
+    *,
+    opacity: float,
+    in_legend: bool,
+) -> list[dict[str, Any]]:
+    """Draw the area between the ends (N, 2) of a band about a signal, at times of its line."""
+    shown = thin_indices(signal.values[span], MAX_POINTS)
+    edge = {
+        "type": "scatter",
+        "mode": "lines",
+        "yaxis": axis_id(axis),
+        "x": to_json_numbers(signal.times[span][shown]),
+        "line": {"width": 0},
+        "hoverinfo": "skip",
+    }
+    low, high = (to_json_numbers(end) for end in ends[span][shown].T)
+    area = {"fill": "tonexty", "fillcolor": theme.fade(theme.BLUE, opacity)}
+    return [
+        {**edge, "name": f"{name}, lower end", "y": low, "showlegend": False},
+        {**edge, "name": name, "y": high, "showlegend": in_legend, **area},
+    ]
 
 
 def _choose_measured_style(times: Floats, drawn: int) -> dict[str, Any]:

@@ -415,7 +415,7 @@ class _EstimateSearch:
             find_feedback(problem, problem.predict(self.theta[None])[0], self.analysis)
         )
         has_controller = bool(feedback) or compute_growth(problem, self.theta) >= MIN_GROWTH
-        if gain <= STRONG_ODDS + max(explained.odds, 0.0) and not has_controller:
+        if gain <= explained.odds and not has_controller:
             return False
         values = dict(zip(problem.free_names, self.theta.tolist(), strict=True))
         self.free_run = ReplacedRun(values, gain, feedback)

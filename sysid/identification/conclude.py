@@ -343,7 +343,7 @@ def _build_identification(
         verdict=conclude_verdict(analysis.estimates, findings, declared),
         warnings=list_warnings(findings),
         substeps=problem.model.solver.substeps,
-        initial=_get_start(asked, best.starts),
+        initial=_get_start(problem, best.starts),
         plant_noise=describe_plant_noise(problem, theta, metrics.rms),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
         history=_extend_histories(best.state, best.ends),
@@ -383,11 +383,11 @@ def _describe_identifiability(uncertainty: Uncertainty | None) -> Identifiabilit
     return Identifiability(uncertainty.condition, uncertainty.groups, uncertainty.singular_values)
 
 
-def _get_start(asked: Problem, starts: StartComparison | None) -> StartKind | None:
+def _get_start(problem: Problem, starts: StartComparison | None) -> StartKind | None:
     """Get the start that the estimates assume; None for that of the model's document."""
     if starts is not None:
         return starts.own.name
-    initial = asked.settings.initial
+    initial = problem.settings.initial
     return None if initial == "auto" else initial
 
 

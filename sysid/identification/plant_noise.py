@@ -9,8 +9,10 @@ from sysid.core.types import FloatArray
 from sysid.core.units import is_blank_unit
 from sysid.models.kalman_filter import is_noise_parameter
 from sysid.results.parts import NoiseSource, PlantNoise
+from sysid.simulation.data_bounds import list_units
 from sysid.simulation.free_run import simulate_free_run
 from sysid.simulation.problem import Problem, compute_metrics
+from sysid.simulation.steps_ahead import measure_prediction_errors
 
 
 def describe_plant_noise(problem: Problem, theta: FloatArray, rms: float) -> PlantNoise | None:
@@ -32,6 +34,7 @@ def describe_plant_noise(problem: Problem, theta: FloatArray, rms: float) -> Pla
         tuple(_list_sources(problem, values, sensor)),
         metrics.rms if is_finite else None,
         metrics.fit_percent if is_finite else None,
+        measure_prediction_errors(problem, theta),
     )
 
 
@@ -39,11 +42,10 @@ def _list_sources(
     problem: Problem, values: Mapping[str, float], sensor: float
 ) -> Iterator[NoiseSource]:
     """List the sensors, and the places of noise by the parameters of the filter."""
-    units = {one.name: one.unit for one in (*problem.model.states, *problem.model.inputs)}
-    units |= {output.name: output.unit for output in problem.model.outputs}
+    units = list_units(problem.model, problem.records)
     for output in problem.model.outputs:
         size = sensor / problem.output_weights[output.name]
-        yield NoiseSource(output.name, "sensor", size, output.unit, None)
+        yield NoiseSource(output.name, "sensor", size, units[output.name], None)
     for parameter in filter(is_noise_parameter, values):
         kind, _, place = parameter[:-1].partition("[")
         size = values[parameter] * sensor

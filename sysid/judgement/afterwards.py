@@ -27,11 +27,12 @@ from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
 
 
-def explain_afterwards(problem: Problem, result: Result) -> Result:
+def explain_afterwards(problem: Problem, result: Result, simulations: Simulations) -> Result:
     """Explain the residuals of a result, and conclude statuses, verdict and warnings anew.
 
-    `problem` is the one that the result solves. A result that is explained already is returned as
-    it is. So is one whose residuals cannot be explained, or are those of the integration.
+    `problem` is the one that the result solves; `simulations` counts what was spent. A result that
+    is explained already is returned as it is. So is one whose residuals cannot be explained, or are
+    those of the integration.
     """
     if result.explained or result.rms <= SOLVER_SHARE * problem.output_scale:
         return result
@@ -39,11 +40,12 @@ def explain_afterwards(problem: Problem, result: Result) -> Result:
     theta = np.array([values[name] for name in problem.free_names])
     with use_one_thread():
         analysis = analyse_estimate(problem, theta)
-        explained = explain_residuals(ResidualContext(problem, theta, analysis))
+        explained = explain_residuals(ResidualContext(problem, theta, analysis, simulations))
         starts = compare_starts(problem, theta, problem.settings.initial)
-        holds, simulated, tried = result.input_hold, problem.predict(theta[None])[0], Simulations()
-        doubts = find_hold_doubts(problem, holds, theta, simulated, result.rms, tried)
-        readings = find_other_readings(problem, holds, doubts, result.parameters, tried)
+        simulations.spent += analysis.evaluations + (starts.evaluations if starts else 0) + 1
+        holds, simulated = result.input_hold, problem.predict(theta[None])[0]
+        doubts = find_hold_doubts(problem, holds, theta, simulated, result.rms, simulations)
+        readings = find_other_readings(problem, holds, doubts, result.parameters, simulations)
         advice = {one.brief: one.advice for one in readings}
     if not explained.is_done:
         return result

@@ -19,7 +19,9 @@ is minimised: the filter-error method (Maine and Iliff 1981) in innovations form
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from math import sqrt
+from typing import Literal, NamedTuple
 
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import FILTERED, NoiseModel, PlantNoise
@@ -70,6 +72,13 @@ def is_noise_parameter(name: str) -> bool:
     return name.partition("[")[0] in _PARAMETERS and name.endswith("]")
 
 
+class NoisePlace(NamedTuple):
+    """Where noise acts inside the plant: as a load there, or as diffusion of a state."""
+
+    place: str
+    kind: Literal["load", "plant"]
+
+
 @dataclass(frozen=True, slots=True)
 class NoiseScales:
     """Sizes in the data that bound the noise.
@@ -85,6 +94,53 @@ class NoiseScales:
     spans: Mapping[str, float]
     period: float
     duration: float
+
+
+class FilterReadings(NamedTuple):
+    """What a smoother reads of a filter at each time, as outputs of the model.
+
+    Attributes
+    ----------
+    states : tuple of str
+        The n states that noise reaches.
+    places : tuple of (str, NoisePlace)
+        The noise among them: its state, and where it acts.
+    outputs : tuple of Output
+        n states; n² covariances, by rows; n² slopes ∂f/∂x, by rows; then for each output of the
+        model its n slopes ∂h/∂x.
+    """
+
+    states: tuple[str, ...]
+    places: tuple[tuple[str, NoisePlace], ...]
+    outputs: tuple[Output, ...]
+
+
+def list_filter_readings(model: Model) -> FilterReadings:
+    """List what a smoother reads of a model with a filter."""
+    equations = {one.name: tree for one, tree in zip(model.states, model.equations, strict=True)}
+    noisy = [name for name in equations if _name_covariance((name, name)) in equations]
+    places = [
+        (name, NoisePlace(name[2:-1] if _is_load(name) else name, kind))
+        for name in noisy
+        for kind in [_find_kind(name, model)]
+        if kind is not None
+    ]
+    trees: list[Expression] = [PastValue(name, "state") for name in noisy]
+    for a, b in product(noisy, noisy):
+        first, second = (a, b) if noisy.index(a) <= noisy.index(b) else (b, a)
+        trees.append(PastValue(_name_covariance((first, second)), "state"))
+    trees += [differentiate(equations[a], b) for a, b in product(noisy, noisy)]
+    trees += [differentiate(one.expression, a) for one, a in product(model.outputs, noisy)]
+    outputs = tuple(Output(f"filter {i}", tree) for i, tree in enumerate(trees))
+    return FilterReadings(tuple(noisy), tuple(places), outputs)
+
+
+def _find_kind(state: str, model: Model) -> Literal["load", "plant"] | None:
+    """Find the kind of noise that drives a state; None if it only follows others."""
+    if _is_load(state):
+        return "load"
+    names = {parameter.name for parameter in model.parameters}
+    return "plant" if f"noise[{state}]" in names else None
 
 
 def check_noise_changes(names: Iterable[str], requested: NoiseModel) -> None:
@@ -279,7 +335,7 @@ def _add_covariance(model: Model, diffusion: Mapping[str, Expression]) -> Model:
     }
     noisy = _find_noisy(names, slopes, diffusion)
     pairs = [(a, b) for i, a in enumerate(noisy) for b in noisy[i:]]
-    covariance = {frozenset(pair): PastValue(f"P[{','.join(pair)}]", "state") for pair in pairs}
+    covariance = {frozenset(pair): PastValue(_name_covariance(pair), "state") for pair in pairs}
     changes = [_make_rate(pair, noisy, slopes, covariance, diffusion) for pair in pairs]
     resting = _list_resting(model)
     rates = {p: rate for p, rate in zip(pairs, changes, strict=True) if resting.issuperset(p)}
@@ -366,6 +422,10 @@ def _make_start(pair: _Pair, solved: Expression | None) -> FixedInitial | Derive
     if pair[0] == pair[1]:
         solved = FunctionCall("max", (solved, ZERO))
     return DerivedInitial(solved, "stationary")
+
+
+def _name_covariance(pair: _Pair) -> str:
+    return f"P[{','.join(pair)}]"
 
 
 def _is_load(state: str) -> bool:

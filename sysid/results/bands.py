@@ -1,4 +1,4 @@
-"""Bands of the outputs of an identified model, on its own records or on new inputs."""
+"""Bands of outputs on the records of a result or on new inputs, and estimated disturbances."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -8,15 +8,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.core.errors import InvalidSettings
-from sysid.core.settings import FILTERED, FoundNoiseModel, Loss, PredictionKind
+from sysid.core.settings import FitSettings, Loss, PredictionKind
+from sysid.core.types import FloatArray
 from sysid.data.records import Channels, Record, Recording
 from sysid.models.model import Model, name_initial_state, replace_substeps
 from sysid.models.parse import keep_terms
 from sysid.models.starts import replace_starts
-from sysid.results.result import FullResult
+from sysid.results.parts import find_sensor_weights
+from sysid.results.result import FittedData, FullResult, Result
 from sysid.simulation.fit_metrics import ChannelMetrics
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import prepare_simulation
+from sysid.uncertainty.disturbances import Disturbance, estimate_disturbances
 from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.output_bands import (
     NoiseDeviations,
@@ -56,9 +59,8 @@ def compute_bands(
     estimates = [estimate for estimate in found.parameters if estimate.name in shared]
     noise = pool_noise(found.agreement.estimation, spread.noise_degrees)
     compared = replace(record, outputs=tuple(_fill_missing(one) for one in record.outputs))
-    [bands] = compute_fit_bands(
-        model, [compared], estimates, data.ties, spread, noise, noise_model="white"
-    )
+    problem, theta = build_fit(model, [compared], estimates, data.ties)
+    [bands] = compute_output_bands(problem, theta, spread, noise)
     return bands
 
 
@@ -72,21 +74,33 @@ def compute_record_bands(
     data, spread = found.data, spread or _read_spread(found)
     if data is None or spread is None:
         return ()
+    problem, theta = _rebuild_fit(found, data)
+    noise = estimate_noise(found.agreement.estimation, spread.noise_degrees)
+    return compute_output_bands(problem, theta, spread, noise)
+
+
+def compute_disturbances(found: FullResult) -> tuple[tuple[Disturbance, ...], ...]:
+    """Compute the disturbances of each record; see `Identification.compute_disturbances`."""
+    data, spread = found.data, _read_spread(found)
+    if found.plant_noise is None or data is None or spread is None:
+        return ()
+    return estimate_disturbances(*_rebuild_fit(found, data), spread)
+
+
+def _rebuild_fit(found: FullResult, data: FittedData) -> tuple[Problem, FloatArray]:
+    """Build the problem of a result on its whole records, and its estimate (D,)."""
     model = data.model
     if model.rule is not None and found.selection:
         model = keep_terms(model, [term.term for term in found.selection])
     if found.substeps != model.solver.substeps:
         model = replace_substeps(model, found.substeps)
-    model = replace_starts(model, found.initial)
-    return compute_fit_bands(
-        model,
+    return build_fit(
+        replace_starts(model, found.initial),
         list_whole_records(data.records, data.validation if data.is_part else ()),
         found.parameters,
         data.ties,
-        spread,
-        estimate_noise(found.agreement.estimation, spread.noise_degrees),
         data.prediction,
-        noise_model=found.noise_model,
+        found,
     )
 
 
@@ -111,18 +125,15 @@ def list_whole_records(records: Sequence[Record], later: Sequence[Record]) -> li
     ]
 
 
-def compute_fit_bands(
+def build_fit(
     model: Model,
     records: Sequence[Record],
     estimates: Iterable[Estimate],
     ties: Mapping[str, str],
-    spread: ParameterSpread,
-    noise: NoiseDeviations,
     prediction: PredictionKind = "simulation",
-    *,
-    noise_model: FoundNoiseModel,
-) -> tuple[tuple[OutputBands, ...], ...]:
-    """Compute the bands on records at some estimates.
+    filtered: Result | None = None,
+) -> tuple[Problem, FloatArray]:
+    """Build the problem of some estimates on records, and its free parameters (D,).
 
     Parameters
     ----------
@@ -130,8 +141,8 @@ def compute_fit_bands(
         With the selected terms and the integration step of the result.
     ties : mapping of str to str
         Expressions of tied parameters that the model does not tie itself.
-    noise_model : FoundNoiseModel
-        That of the result: with noise inside the plant the outputs are predictions.
+    filtered : Result, optional
+        The result, if its outputs are to be predictions where noise is inside the plant.
     """
     own_ties = {parameter.name for parameter in model.parameters if parameter.tied is not None}
     values, changes = dict[str, float](), dict[str, dict[str, Any]]()
@@ -142,16 +153,16 @@ def compute_fit_bands(
         elif estimate.status != "tied" or estimate.name not in own_ties:
             changes[estimate.name] = _write_change(estimate)
     weights = {output.name: 1.0 for output in model.outputs}
-    problem = Problem.build(
-        model,
-        records,
-        parameters=changes,
-        prediction=prediction,
-        loss=Loss(noise_model=noise_model if noise_model in FILTERED else "white"),
-        weights=weights,
-    )
-    theta = np.array([values[name] for name in problem.free_names])
-    return compute_output_bands(problem, theta, spread, noise)
+    settings = FitSettings(changes, prediction, weights=weights)
+    if filtered is not None and filtered.plant_noise is not None:
+        settings = replace(
+            settings,
+            loss=Loss(noise_model=filtered.noise_model),
+            weights=weights | find_sensor_weights(filtered.plant_noise, values),
+            deviations=filtered.noise_deviations,
+        )
+    problem = Problem.from_settings(model, records, settings)
+    return problem, np.array([values[name] for name in problem.free_names])
 
 
 def estimate_noise(agreement: Iterable[ChannelMetrics], degrees: float) -> NoiseDeviations:

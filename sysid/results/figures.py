@@ -25,6 +25,7 @@ from sysid.figures import plotly
 from sysid.figures.data import (
     BandTraces,
     CorrelationTrace,
+    DisturbanceTraces,
     ExperimentTraces,
     OutputTraces,
     SearchTraces,
@@ -33,7 +34,7 @@ from sysid.figures.data import (
 from sysid.figures.plotly import Abscissa, Figure, apply_theme, empty_figure, has_points
 from sysid.figures.posterior_figures import plot_posterior
 from sysid.figures.residual_figures import plot_residuals
-from sysid.figures.signal_figures import plot_response
+from sysid.figures.signal_figures import plot_disturbances, plot_response
 from sysid.figures.stack import stack_figures
 from sysid.figures.theme import Theme
 from sysid.models.parameters import Parameter, ParameterScale
@@ -41,10 +42,18 @@ from sysid.residuals.residual_tests import CorrelationFunction
 from sysid.results.result import FullResult, Result, find_output_unit
 
 if TYPE_CHECKING:
+    from sysid.uncertainty.disturbances import Disturbance
     from sysid.uncertainty.output_bands import OutputBands
 
 FigureName = Literal[
-    "history", "convergence", "response", "residuals", "correlation", "waterfall", "posterior"
+    "history",
+    "convergence",
+    "response",
+    "disturbances",
+    "residuals",
+    "correlation",
+    "waterfall",
+    "posterior",
 ]
 FIGURES: tuple[FigureName, ...] = get_args(FigureName)
 RecordTraces: TypeAlias = tuple[tuple[OutputTraces, ...], tuple[SignalTrace, ...]]
@@ -53,12 +62,19 @@ TITLES: Mapping[FigureName, str] = {
     "history": "Progress of every island",
     "convergence": "Convergence of the parameters",
     "response": "Measured against identified",
+    "disturbances": "Estimated disturbances",
     "residuals": "Correlation of the residuals",
     "correlation": "Correlation of the estimates",
     "waterfall": "What each island found",
     "posterior": "Posterior",
 }
-_USUAL: tuple[FigureName, ...] = ("response", "residuals", "correlation", "waterfall")
+_USUAL: tuple[FigureName, ...] = (
+    "response",
+    "disturbances",
+    "residuals",
+    "correlation",
+    "waterfall",
+)
 
 
 def plot_result(
@@ -110,6 +126,8 @@ def _iterate_names(names: Sequence[FigureName | Sequence[FigureName]]) -> Iterat
 def _describe_missing_figure(name: FigureName) -> str:
     if name == "posterior":
         return "no posterior was sampled; call identify(…, posterior=True)"
+    if name == "disturbances":
+        return "no noise acts inside the plant, or the result has no standard errors"
     return f"the result has no data for the figure {name!r}"
 
 
@@ -119,7 +137,7 @@ def draw_figures(
     """Draw figures of a result that have data, each with its title.
 
     `experiment` is one of the records, of which those of the validation data come last. Of
-    residuals the nearest tested record is drawn.
+    residuals the nearest tested record is drawn, and of disturbances the nearest fitted one.
 
     Raises
     ------
@@ -133,8 +151,16 @@ def draw_figures(
         raise InvalidSettings("/experiment", detail)
     source = ResultFigures(found)
     tested = () if source.residuals is None else source.residuals.experiments
-    numbers = {"residuals": max(experiment - len(experiments) + len(tested), 0)}
-    recorded = {"response": [one.name for one in experiments], "residuals": tested}
+    disturbed = [one.name for one in source.disturbances] if "disturbances" in names else []
+    numbers = {
+        "disturbances": max(min(experiment, len(disturbed) - 1), 0),
+        "residuals": max(experiment - len(experiments) + len(tested), 0),
+    }
+    recorded: dict[FigureName, Sequence[str]] = {
+        "response": [one.name for one in experiments],
+        "disturbances": disturbed,
+        "residuals": tested,
+    }
     drawn = []
     for name in names:
         number, listed = numbers.get(name, experiment), recorded.get(name, ())
@@ -154,7 +180,7 @@ class FigureLook:
     columns : int
         Small plots in a row; 1 on a narrow page.
     start, stop : float or None
-        Time window of the response, s.
+        Time window of the response and of the disturbances, s.
     """
 
     abscissa: Abscissa = "generations"
@@ -173,7 +199,8 @@ class TestedResiduals(NamedTuple):
 class RunFigures(Protocol):
     """What the figures of a run are drawn from, each part read when a figure needs it.
 
-    Until the run has a result it is None, there are no `experiments`, and no `residuals`.
+    Until the run has a result it is None, and there are no `experiments`, `disturbances` and
+    `residuals`.
     """
 
     @property
@@ -187,6 +214,10 @@ class RunFigures(Protocol):
     @property
     def experiments(self) -> Sequence[ExperimentTraces]:
         """The records with outputs and bands."""
+
+    @property
+    def disturbances(self) -> Sequence[DisturbanceTraces]:
+        """The estimated disturbances of each record that was fitted."""
 
     @property
     def residuals(self) -> TestedResiduals | None:
@@ -208,6 +239,8 @@ def draw_run_figure(
     match name:
         case "response":
             return _draw_response(run.experiments, experiment, look)
+        case "disturbances":
+            return _draw_disturbances(run.disturbances, experiment, look)
         case "residuals":
             return _draw_residuals(run.residuals, experiment, min(look.columns, 2))
         case "correlation":
@@ -215,13 +248,18 @@ def draw_run_figure(
         case "posterior":
             posterior, estimates = (result.posterior, result.parameters) if result else (None, ())
             return plot_posterior(posterior, estimates, correlation, is_narrow=look.columns == 1)
-        case "history":
-            return plotly.plot_history(run.search, look.abscissa)
-        case "convergence":
-            return plotly.plot_convergence(run.search, look.columns)
-        case "waterfall":
-            islands, search = () if result is None else result.islands, run.search
-            return plotly.plot_waterfall(islands, search.unit, search.fitness_label)
+        case _:
+            return _draw_search(run, name, look)
+
+
+def _draw_search(run: RunFigures, name: FigureName, look: FigureLook) -> Figure:
+    search, result = run.search, run.result
+    if name == "history":
+        return plotly.plot_history(search, look.abscissa)
+    if name == "convergence":
+        return plotly.plot_convergence(search, look.columns)
+    islands = () if result is None else result.islands
+    return plotly.plot_waterfall(islands, search.unit, search.fitness_label)
 
 
 def list_report_figures(
@@ -234,6 +272,7 @@ def list_report_figures(
     tested = run.residuals
     recorded: dict[FigureName, Sequence[str]] = {
         "response": [experiment.name for experiment in run.experiments],
+        "disturbances": [record.name for record in run.disturbances],
         "residuals": () if tested is None else tested.experiments,
     }
     each = [
@@ -259,6 +298,16 @@ def _draw_response(
         return empty_figure()
     figure = plot_response(experiments[number], look.start, look.stop)
     figure["layout"]["meta"]["experiments"] = [experiment.name for experiment in experiments]
+    return figure
+
+
+def _draw_disturbances(
+    records: Sequence[DisturbanceTraces], number: int, look: FigureLook
+) -> Figure:
+    if not records:
+        return empty_figure()
+    figure = plot_disturbances(records[number], look.start, look.stop)
+    figure["layout"]["meta"]["experiments"] = [record.name for record in records]
     return figure
 
 
@@ -300,6 +349,13 @@ class ResultFigures:
 
         experiments = list_experiments(self.result)
         return add_bands(experiments, compute_record_bands(self.result)) if experiments else []
+
+    @cached_property
+    def disturbances(self) -> Sequence[DisturbanceTraces]:
+        """The estimated disturbances; none without the fitted data."""
+        from sysid.results.bands import compute_disturbances  # it imports the compiler
+
+        return to_disturbance_traces(compute_disturbances(self.result))
 
     @cached_property
     def residuals(self) -> TestedResiduals | None:
@@ -432,6 +488,28 @@ def to_signal_trace(channel: Channel) -> SignalTrace:
         times, values = (np.append(history, samples[0]) for history, samples in pairs)
         before = SignalTrace(channel.name, channel.unit, times, values, held)
     return SignalTrace(channel.name, channel.unit, channel.times, channel.values, held, before)
+
+
+def to_disturbance_traces(
+    records: Sequence[Sequence["Disturbance"]],
+) -> list[DisturbanceTraces]:
+    """Convert the estimated disturbances of each record to the data of their figure."""
+    return [
+        DisturbanceTraces(
+            f"record {number}",
+            tuple(
+                (SignalTrace(describe_place(one), one.unit, one.times, one.values), one.band)
+                for one in disturbances
+            ),
+        )
+        for number, disturbances in enumerate(records, 1)
+    ]
+
+
+def describe_place(disturbance: "Disturbance") -> str:
+    """Say what a disturbance is, and where it acts."""
+    kind = "load at" if disturbance.kind == "load" else "state"
+    return f"{kind} {disturbance.place}"
 
 
 def to_correlation_trace(correlation: CorrelationFunction) -> CorrelationTrace:

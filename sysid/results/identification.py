@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
-from sysid.core.errors import UnknownParameter
+from sysid.core.errors import InvalidSettings, UnknownParameter
 from sysid.data.records import Record
 from sysid.figures.theme import Theme
 from sysid.results.figures import FigureName, plot_result
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from sysid.data.records import Channels, Recording
+    from sysid.uncertainty.disturbances import Disturbance
     from sysid.uncertainty.output_bands import OutputBands
 
 
@@ -103,13 +104,14 @@ class Identification(FullResult):
     ) -> Any:
         """Draw figures one below the other, as a figure of Plotly.
 
-        Without names: measured against identified output with the residuals, their correlation
-        functions, the correlation of the estimates, and what each island of the search found.
+        Without names: measured against identified output with the residuals, the estimated
+        disturbances if there are any, correlation functions of the residuals, the correlation of
+        the estimates, and what each island of the search found.
 
         Parameters
         ----------
-        *names : {"response", "residuals", "correlation", "waterfall", "history", "convergence", \
-"posterior"}
+        *names : {"response", "disturbances", "residuals", "correlation", "waterfall", "history", \
+"convergence", "posterior"}
             The figures to draw, also as a list.
         experiment : int
             Which record, from 0, if there are several.
@@ -173,6 +175,36 @@ class Identification(FullResult):
         from sysid.results.bands import compute_bands  # it imports the compiler
 
         return compute_bands(self, inputs, channels=channels, times=times, experiment=experiment)
+
+    def compute_disturbances(self, experiment: int = 0) -> "tuple[Disturbance, ...]":
+        """Compute the disturbances over time, with 95 % bands, if noise acts inside the plant.
+
+        They are the loads, and the states that noise moves. Each time is estimated from the whole
+        record, those after it included.
+
+        Parameters
+        ----------
+        experiment : int
+            Which record of the fit, from 0, if there are several.
+
+        Returns
+        -------
+        tuple of Disturbance
+            In the units of their places.
+
+        Raises
+        ------
+        InvalidSettings
+            If no noise acts inside the plant, if the result has no standard errors, or if there is
+            no such record.
+        """
+        from sysid.results.bands import compute_disturbances  # it imports the compiler
+
+        records = compute_disturbances(self)
+        if not 0 <= experiment < len(records):
+            detail = f"found {experiment!r}; the result has disturbances of {len(records)} records"
+            raise InvalidSettings("/experiment", detail)
+        return records[experiment]
 
     def to_pandas(self) -> Any:
         """Return the estimates as a table of pandas, one row for each parameter.

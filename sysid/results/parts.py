@@ -11,6 +11,7 @@ from sysid.core.distributions import chi_square_limit
 from sysid.core.settings import FoundNoiseModel
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
+from sysid.simulation.fit_metrics import PredictionError
 
 STRONG_EVIDENCE = 6.0
 """Difference of BIC: odds of 20 to 1 (Kass and Raftery 1995)."""
@@ -214,7 +215,7 @@ class NoiseSource:
 
 @dataclass(frozen=True, slots=True)
 class PlantNoise:
-    """Noise inside the plant, and the free run beside the predictions that the result shows.
+    """Noise inside the plant, and errors from one sample ahead to the free run.
 
     Attributes
     ----------
@@ -225,11 +226,32 @@ class PlantNoise:
         if it diverges.
     fit_free : float or None
         Its fit, %.
+    prediction_errors : tuple of PredictionError
+        RMS errors of predictions 1, 2, 5, 10, … samples ahead, up to a tenth of the shortest
+        record.
     """
 
     sources: tuple[NoiseSource, ...]
     rms_free: float | None
     fit_free: float | None
+    prediction_errors: tuple[PredictionError, ...] = ()
+
+
+def find_sensor_weights(noise: PlantNoise, values: Mapping[str, float]) -> dict[str, float]:
+    """Find the weight w of each output in a filter: 1/w is its sensor's relative deviation.
+
+    Sizes of noise among the `values` of the parameters are relative to the same deviation.
+    """
+    relative_to = [
+        one.deviation / values[f"{'load' if one.kind == 'load' else 'noise'}[{one.place}]"]
+        for one in noise.sources
+        if one.kind != "sensor"
+    ]
+    return {
+        one.place: relative_to[0] / one.deviation if one.deviation > 0.0 else 1.0
+        for one in noise.sources
+        if one.kind == "sensor"
+    }
 
 
 def _is_open(fit: OrderFit, best: OrderFit, samples: int) -> bool:

@@ -306,9 +306,10 @@ class FullResult(Result):
     data: FittedData | None = None
 
 
-def find_output_unit(result: FullResult) -> str:
+def find_output_unit(result: Result) -> str:
     """Find the unit of the RMS of a result: that of its output, or σ for several together."""
+    data = result.data if isinstance(result, FullResult) else None
     return find_rms_unit(
         {metrics.output: metrics.unit for metrics in result.agreement.estimation},
-        lambda _: "1" if result.data is None else result.data.records[0].outputs[0].unit,
+        lambda _: "1" if data is None else data.records[0].outputs[0].unit,
     )

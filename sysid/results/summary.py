@@ -8,6 +8,7 @@ from typing import Any
 from sysid.core.lazy_names import load_library
 from sysid.core.text import (
     DASH,
+    bracket_unit,
     format_estimate,
     format_interval,
     plain_estimate,
@@ -26,6 +27,7 @@ ESTIMATE_HEADINGS = ("parameter", "estimate", "95 % interval", "standard error",
 """Columns of each table of estimates, in terminals, notebooks and pages alike."""
 
 _MAX_NOTES = 3
+_MAX_HORIZONS = 6
 _BECAUSE = {
     "starts": "the search settled",
     "residuals": "the search settled, as nothing but noise is left",
@@ -105,6 +107,7 @@ def list_evidence(result: Result) -> list[str]:
         evidence.append(describe_residuals(result))
     if result.plant_noise is not None:
         evidence.append(describe_noise(result.plant_noise))
+        evidence += describe_predictions(result.plant_noise, find_output_unit(result))
     if result.order_comparison is not None and not any(
         one.severity != "note" or one.explanation == "order" for one in result.findings
     ):
@@ -152,6 +155,26 @@ def describe_noise(noise: PlantNoise) -> str:
     ]
     free = "diverges" if noise.fit_free is None else f"fits {noise.fit_free:.1f} %"
     return f"noise: {', '.join(sources)}; the free run {free}"
+
+
+def describe_predictions(noise: PlantNoise, unit: str) -> list[str]:
+    """Say how large the errors of predictions are, from the next sample to the free run.
+
+    Of many horizons each second one is told, and the furthest.
+    """
+    errors = noise.prediction_errors
+    if not errors:
+        return []
+    told = errors if len(errors) <= _MAX_HORIZONS else (*errors[:-1:2], errors[-1])
+    texts = [f"{_format_rms(one.rms)} at {one.samples}" for one in told]
+    return [
+        f"RMS of predictions so many samples ahead{bracket_unit(unit)}: {', '.join(texts)}, "
+        f"free run {_format_rms(noise.rms_free)}"
+    ]
+
+
+def _format_rms(rms: float | None) -> str:
+    return "diverged" if rms is None else f"{rms:.3g}"
 
 
 def describe_search(evidence: SearchEvidence) -> str:

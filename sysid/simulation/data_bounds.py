@@ -14,6 +14,7 @@ from sysid.core.types import FloatArray
 from sysid.core.units import divide_units, is_blank_unit
 from sysid.data.records import Channel, Record
 from sysid.models.kalman_filter import NoiseScales
+from sysid.models.model import Model, ModelSignal, Output
 from sysid.models.parameters import RATE_UNIT, BoundsRule, Parameter
 
 Interval = tuple[float, float]
@@ -104,6 +105,16 @@ def find_signal_units(records: Sequence[Record]) -> dict[str, str]:
     channels = [c for record in records for c in (*record.inputs, *record.outputs)]
     units = {c.name: _find_common_unit(d for d in channels if d.name == c.name) for c in channels}
     return {name: unit for name, unit in units.items() if unit is not None}
+
+
+def list_units(model: Model, records: Sequence[Record]) -> dict[str, str]:
+    """List the units of states, inputs and outputs: the records' where the model has none."""
+    signals: list[ModelSignal | Output] = [*model.states, *model.inputs, *model.outputs]
+    recorded = find_signal_units(records)
+    return {
+        one.name: recorded.get(one.name, one.unit) if is_blank_unit(one.unit) else one.unit
+        for one in signals
+    }
 
 
 def _find_common_unit(channels: Iterable[Channel]) -> str | None:

@@ -100,3 +100,22 @@ class Metrics:
     unit: str
     fit_percent: float
     channels: tuple[ChannelMetrics, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PredictionError:
+    """Error of predictions so many samples ahead.
+
+    Attributes
+    ----------
+    samples : int
+        Samples ahead.
+    time : float
+        Mean time ahead, s.
+    rms : float or None
+        RMS error, in the unit of the result's `rms`; none if a prediction diverged.
+    """
+
+    samples: int
+    time: float
+    rms: float | None

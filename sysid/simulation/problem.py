@@ -15,8 +15,9 @@ from sysid.data.records import Record
 from sysid.kernels.compilation.build import get_kernel_address
 from sysid.kernels.layout import KernelVariant
 from sysid.kernels.signals.past_reads import list_delaying_inputs
+from sysid.language.tree import Number
 from sysid.models.kalman_filter import add_kalman_filter, check_noise_changes
-from sysid.models.model import Model, build_initial_parameters
+from sysid.models.model import Correction, Model, Output, build_initial_parameters
 from sysid.models.model_delays import check_delays
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.starts import replace_starts
@@ -33,6 +34,7 @@ from sysid.simulation.evaluator import (
     predict_population,
 )
 from sysid.simulation.experiment_arrays import (
+    OutputSamples,
     PackedExperiment,
     are_on_grid,
     find_range,
@@ -334,6 +336,36 @@ class Problem:
             _shared={},  # may depend on inputs
         )
 
+    def observe(self, outputs: Sequence[Output]) -> "Problem":
+        """Build the problem with more outputs, read at each grid point before any sample there.
+
+        They come first, and nothing is compared with them.
+        """
+        experiments = tuple(
+            replace(
+                experiment,
+                outputs=(*[_observe_grid(experiment)] * len(outputs), *experiment.outputs),
+            )
+            for experiment in self.experiments
+        )
+        unseen = [Correction(output.name, Number(0.0), (), ()) for output in outputs]
+        model, averaged = (
+            replace(
+                one,
+                outputs=(*outputs, *one.outputs),
+                corrections=(*unseen, *one.corrections) if one.corrections else (),
+            )
+            for one in (self.model, self.averaged_model)
+        )
+        return replace(
+            self,
+            model=model,
+            averaged_model=averaged,
+            experiments=experiments,
+            evaluator=_build_evaluator(averaged, experiments, self.all_parameters, self.settings),
+            _shared={},
+        )
+
     def _fill_evaluator(
         self, experiments: Sequence[GridExperiment], are_alike: bool, write: _WriteValues
     ) -> Evaluator:
@@ -473,6 +505,12 @@ class Problem:
             self.split_by_output(values), self.split_by_output(self.plain_weight), strict=True
         )
         return [(value[name], weight[name]) for value, weight in pairs for name in value]
+
+
+def _observe_grid(experiment: GridExperiment) -> OutputSamples:
+    """Make samples at each grid point that nothing is compared with."""
+    zeros = np.zeros(experiment.grid.points)
+    return OutputSamples(np.arange(zeros.size, dtype=np.float64), zeros, zeros, zeros, zeros)
 
 
 def _divide_weights(

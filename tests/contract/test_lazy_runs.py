@@ -229,7 +229,7 @@ def test_a_list_of_runs_has_those_that_are_made_and_progress_counts_all(sqlite_p
     job = sqlite_place.submit(**SWEEP)
     with sqlite_place.database.read_session() as session:
         listed = list_runs(session, job, None, 100, RunQuery())
-        progress = submit.to_job_out(JobRepository(session).get(job)).progress
+        progress = submit.describe_job(session, JobRepository(session).get(job)).progress
         made = session.scalar(select(func.count()).where(Run.job_id == job))
         assert made == len(listed.items) == AT_ONCE
     assert (progress.runs, progress.finished) == (N_RUNS, 0)

@@ -14,12 +14,12 @@ import pytest
 from service.core.process.process_identity import describe_process, is_awake, is_gone
 from service.core.states import JobState
 from service.dispatch.held_leases import HeldLeases
-from service.queue.clocks import choose_database_clock
 from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
 from service.queue.leases import HUNG_AFTER, SPARED_LOSS_FACTOR, LeaseQueue
 from service.queue.orphaned_jobs import Reaper, reap_jobs
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.storage import columns
+from service.storage.clocks import choose_database_clock
 from service.storage.columns import utc_now
 from sysid.core.machine import read_machine_id
 from tests.support.cluster.dispatch_place import until

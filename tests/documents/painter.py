@@ -40,5 +40,6 @@ def _take_picture(browser: Any, path: Path, figure: Any, width: int, height: int
     page = browser.new_page(viewport={"width": width, "height": height})
     page.set_content(figure.to_html(include_plotlyjs=True, config={"staticPlot": True}))
     page.wait_for_selector(".plot-container .main-svg")
+    page.add_style_tag(content="body { margin: 0 }")  # it would cut the last pixels off
     page.screenshot(path=path)
     page.close()

@@ -181,6 +181,22 @@ def test_every_part_of_compose_has_a_health_check_of_its_own() -> None:
     assert asked == {name: ["CMD", "lagid", "health", part] for name, part in parts.items()}
 
 
+def test_the_s3_server_is_built_at_the_version_that_its_image_is_named_after() -> None:
+    """Since the repair of CVE-2025-62506 MinIO publishes no images."""
+    services = _compose()["services"]
+    assert services["store"]["image"] == services["bucket"]["image"]
+    name, _, version = services["store"]["image"].partition(":")
+    assert name == "lagid/store"
+    assert version >= "RELEASE.2025-10-15"
+    build = services["store"]["build"]
+    text = (DOCKER / build["context"] / build["dockerfile"]).read_text()
+    assert f"github.com/minio/minio@{version} " in text
+    copied = re.findall(r"/go/bin/(\w+)", text)
+    assert set(copied) == {services["store"]["command"][0], "mc"}
+    assert services["store"]["healthcheck"]["test"][1] == "mc"
+    assert "mc mb --ignore-existing store/lagid" in services["bucket"]["command"][-1]
+
+
 def test_a_slow_start_of_the_dispatcher_is_not_ill_before_it_gives_up_itself() -> None:
     patience = Settings.model_fields["start_seconds"].default
     check = _compose()["services"]["dispatcher"]["healthcheck"]

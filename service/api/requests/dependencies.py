@@ -14,7 +14,7 @@ from service.api.event_feed import EventFeed
 from service.api.requests.failure_delay import FailureDelay
 from service.api.requests.request_log import get_request_id
 from service.api.store_probe import StoreProbe
-from service.core.process.concurrency import FairPlaces
+from service.core.process.concurrency import FairPlaces, ReaderPlaces
 from service.core.settings import Settings
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database, SessionOwner
@@ -34,8 +34,10 @@ class Parts:
         For a request, that of its caller: it shows the caller's project alone.
     stopping : Event
         Set as soon as the process is asked to end. Open event streams then close.
-    upload_places, reader_places : FairPlaces
-        Places of the uploads that are received, and of those that are read.
+    upload_places : FairPlaces
+        Places of the uploads that are received.
+    readers : ReaderPlaces
+        Places of the child processes that read uploads or do long simulations.
     feed : EventFeed
         The events of all jobs that have a stream.
     probe : StoreProbe
@@ -51,7 +53,7 @@ class Parts:
     store: ObjectStore
     stopping: Event
     upload_places: FairPlaces
-    reader_places: FairPlaces
+    readers: ReaderPlaces
     feed: EventFeed
     probe: StoreProbe
     scrubber: Scrubber
@@ -71,7 +73,10 @@ class Parts:
             stopping,
             # A body that arrives slowly takes a place of its own project alone.
             upload_places=build(settings.max_connections, most),
-            reader_places=build(most, max(1, most - 1)),
+            readers=ReaderPlaces(
+                build(most, max(1, most - 1), what="uploads and simulations (LAGID_MAX_UPLOADS)"),
+                settings.reader_memory_bytes,
+            ),
             feed=feed,
             probe=StoreProbe(store),
             scrubber=Scrubber(store, settings.scrub_days),

@@ -126,7 +126,7 @@ async def add_dataset(
     project, settings = parts.database.owner.project_id, parts.settings
     async with (
         receive_upload(request, settings, parts.upload_places, project) as upload,
-        parts.reader_places.hold_awaiting(project),
+        parts.readers.places.hold_awaiting(project),
     ):
         stored = await run_in_threadpool(
             datasets.add_upload,
@@ -143,7 +143,7 @@ async def add_dataset(
                 missing=missing,
                 clock=clock,
                 limits=UploadLimits(
-                    file_bytes=settings.max_upload_bytes, memory_bytes=settings.reader_memory_bytes
+                    file_bytes=settings.max_upload_bytes, memory_bytes=parts.readers.memory_bytes
                 ),
             ),
         )
@@ -154,7 +154,9 @@ async def add_dataset(
 def simulate_dataset(body: SimulateIn, parts: PartsDep, response: Response) -> DatasetOut:
     """Simulate a dataset from a model, its true parameters, inputs and noise."""
     return _dataset_response(
-        simulated.simulate_dataset(parts.database, parts.store, body), response, body.name
+        simulated.simulate_dataset(parts.database, parts.store, parts.readers, body),
+        response,
+        body.name,
     )
 
 
@@ -163,7 +165,7 @@ def derive_dataset(
     dataset_id: str, body: DeriveIn, parts: PartsDep, response: Response
 ) -> DatasetOut:
     """Derive a dataset from another, by its id or name: add noise, resample, trim, select etc."""
-    stored = datasets.derive_dataset(parts.database, parts.store, dataset_id, body)
+    stored = datasets.derive_dataset(parts.database, parts.store, parts.readers, dataset_id, body)
     return _dataset_response(stored, response, body.name)
 
 

@@ -25,6 +25,7 @@ from service.repositories.job_rows import JobRepository
 from service.repositories.run_rows import RunOrder
 from service.runs import runs
 from service.runs.run_schemas import RunPage
+from service.storage.clocks import choose_database_clock
 from service.sweeps import summary, table
 from service.sweeps.sweep_schemas import SummaryOut
 from service.trends import batch_trend
@@ -109,7 +110,8 @@ def delete_job(
 @router.post("/{job_id}:cancel")
 def cancel_job(job_id: str, session: WriteSession) -> JobOut:
     """Cancel a job: immediately if it is queued, within moments if it runs."""
-    return submit.to_job_out(JobRepository(session).cancel(job_id))
+    job = JobRepository(session).cancel(job_id)
+    return submit.to_job_out(job, choose_database_clock(session))
 
 
 @router.post("/{job_id}:resume", status_code=status.HTTP_202_ACCEPTED)
@@ -124,7 +126,7 @@ def resume_job(
 ) -> JobOut:
     """Queue a failed or cancelled job again; it continues from its last checkpoints."""
     job = submit.resume_job(session, job_id, parts.settings, only_failed=failed)
-    return set_location(submit.to_job_out(job), response)
+    return set_location(submit.to_job_out(job, choose_database_clock(session)), response)
 
 
 @router.post("/{job_id}:clone", status_code=status.HTTP_202_ACCEPTED)

@@ -126,7 +126,9 @@ def run_page(run_id: str, request: Request, session: ReadSession, parts: PartsDe
 def simulate_page(run_id: str, request: Request, parts: PartsDep) -> Response:
     """Show the form to simulate the model of a run; with a full query, the simulation."""
     query = dict(request.query_params)
-    answer = simulate(parts.database, parts.store, run_id, query, str(request.base_url))
+    answer = simulate(
+        parts.database, parts.store, parts.readers, run_id, query, str(request.base_url)
+    )
     if answer.is_csv:
         return csv_response(answer.text, "simulation")
     return HtmlPage(answer.text, answer.status)

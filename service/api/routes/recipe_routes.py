@@ -21,7 +21,7 @@ def submit_noise_sweep(
 ) -> JobOut:
     """Queue a noise sweep, σ × replicates × methods, of a simulated record or a dataset."""
     job = noise_sweep.submit_noise_sweep(
-        parts.database, parts.store, parts.settings, body, idempotency_key
+        parts.database, parts.store, parts.readers, parts.settings, body, idempotency_key
     )
     return set_location(job, response)
 

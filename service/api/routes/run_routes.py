@@ -23,6 +23,7 @@ from service.repositories.run_rows import RunRepository
 from service.runs import (
     bands,
     comparison,
+    disturbances,
     exports,
     fitted,
     profiles,
@@ -35,6 +36,7 @@ from service.runs.run_schemas import (
     BandsOut,
     CompareIn,
     ComparisonOut,
+    DisturbancesOut,
     ExportedModelOut,
     FreeRunIn,
     FreeRunOut,
@@ -112,6 +114,14 @@ def read_bands(
     return bands.build_bands(session, parts.store, run_id, max_points)
 
 
+@router.get("/{run_id}/disturbances")
+def read_disturbances(
+    run_id: str, session: ReadSession, parts: PartsDep, max_points: MaxPoints = 1000
+) -> DisturbancesOut:
+    """Read the estimated disturbances with their 95 % bands, if noise acts inside the plant."""
+    return disturbances.build_disturbances(session, parts.store, run_id, max_points)
+
+
 @router.get("/{run_id}/residuals")
 def read_residual_tests(run_id: str, session: ReadSession, parts: PartsDep) -> ResidualsOut:
     """Read the residual tests: auto- and cross-correlation with 95 and 99 % bands."""
@@ -158,7 +168,9 @@ def simulate_run(
     run_id: str, body: RunSimulationIn, parts: PartsDep, max_points: MaxPoints = 1000
 ) -> RunSimulationOut:
     """Simulate the identified model on new inputs or under P, PI or PID control."""
-    return run_simulation.simulate_run(parts.database, parts.store, run_id, body, max_points)
+    return run_simulation.simulate_run(
+        parts.database, parts.store, parts.readers, run_id, body, max_points
+    )
 
 
 @router.post("/{run_id}:validate")

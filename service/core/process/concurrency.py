@@ -1,6 +1,6 @@
 """Places for heavy requests, which projects share: some run, some wait, all others get 503.
 
-A simulation of a million samples takes a second of a core and hundreds of megabytes. Every request
+A simulation of a million samples takes seconds of a core and hundreds of megabytes. Every request
 that waits in a thread holds one of the threads that all others need.
 
 A free place goes to the project that has the fewest, and among those to the one that was served
@@ -13,6 +13,7 @@ from collections import Counter, deque
 from collections.abc import AsyncIterator, Iterator
 from concurrent.futures import Future
 from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass
 from threading import Lock
 
 from service.core.errors import ServiceBusy
@@ -144,6 +145,20 @@ class FairPlaces:
         return ServiceBusy(
             f"no place for {self._what} became free within {self._seconds:g} s; ask again"
         )
+
+
+@dataclass(frozen=True, slots=True)
+class ReaderPlaces:
+    """Places of child processes that read uploads or do long simulations.
+
+    Attributes
+    ----------
+    memory_bytes : int
+        Memory of each child.
+    """
+
+    places: FairPlaces
+    memory_bytes: int
 
 
 simulation_places = FairPlaces(MAX_RUNNING, MAX_OF_PROJECT)

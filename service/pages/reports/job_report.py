@@ -13,7 +13,6 @@ from markupsafe import Markup
 from sqlalchemy.orm import Session
 
 from service.core.states import JobState
-from service.datasets.rms_unit import find_rms_unit
 from service.figures.embed import strip_template, templates_json, to_script_json, write_figures
 from service.figures.svg import is_drawable, to_svg
 from service.figures.trend_figure import plot_trend
@@ -71,7 +70,7 @@ def render_large_report(
     base_url : str
         Address of the service, for links to all runs.
     """
-    view = to_job_view(job, find_rms_unit(session, job.spec), created)
+    view = to_job_view(session, job)
     best, worst = _best_and_worst_runs(session, job, is_batch=view.is_batch)
     failed = (
         RunRepository(session)
@@ -175,7 +174,7 @@ def render_job_report(session: Session, store: ObjectStore, job_id: str, base_ur
     created, batch = datetime.now(UTC), load_trend(session, job)
     if job.n_runs > MAX_LISTED_RUNS:
         return render_large_report(session, store, job, batch, created, base_url)
-    view = to_job_view(job, find_rms_unit(session, job.spec), created)
+    view = to_job_view(session, job)
     runs = RunRepository(session).list_page(job.id, limit=MAX_LISTED_RUNS).items
     is_in_order = view.is_batch or len(runs) <= MAX_FULL_RUNS
     order: RunOrder = "number" if is_in_order else "best_rms"

@@ -120,7 +120,7 @@ function showMessage(plot, text) {
 
 /** Fetch the visible part of a thinned signal again, with more of its samples. */
 function onZoom(plot, change) {
-  if (!['response', 'signals'].includes(plot.dataset.figure)) return;
+  if (!['response', 'disturbances', 'signals'].includes(plot.dataset.figure)) return;
   if (change['xaxis.autorange']) {
     if (plot.dataset.zoomed) draw(plot);
     delete plot.dataset.zoomed;

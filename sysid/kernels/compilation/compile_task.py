@@ -65,14 +65,28 @@ _TYPE = "type"
 
 def encode_task(task: CompileTask) -> bytes:
     """Encode a task, without those parts of the model that no kernel depends on."""
-    source = replace(task.model, title="", document={}, terms=(), rule=None, selection=None)
-    return json.dumps(_to_json(replace(task, model=source))).encode()
+    return json.dumps(_to_json(replace(task, model=_strip_model(task.model)))).encode()
 
 
 def decode_task(text: bytes) -> CompileTask:
     """Decode what `encode_task` has encoded."""
     task: CompileTask = _from_json(json.loads(text))
     return task
+
+
+def encode_model(model: Model) -> Any:
+    """Encode a model as JSON values, without those parts that no simulation depends on."""
+    return _to_json(_strip_model(model))
+
+
+def decode_model(value: Any) -> Model:
+    """Decode what `encode_model` has encoded."""
+    model: Model = _from_json(value)
+    return model
+
+
+def _strip_model(model: Model) -> Model:
+    return replace(model, title="", document={}, terms=(), rule=None, selection=None)
 
 
 def _to_json(value: Any) -> Any:

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+from service.core.computed import ComputedValues
 from service.jobs.stored_run import StoredRun
-from service.runs import explained
+from service.repositories.project_rows import ProjectRepository
+from service.runs import bands, explained, fitted
 from service.storage.storage_errors import ObjectMissing
 from tests.support.service.local_runs import identify_job
 from tests.support.service.web_app import parts_of, store_csv
@@ -28,6 +30,13 @@ class Swept(NamedTuple):
     def list_runs(self) -> list[dict[str, Any]]:
         items: list[dict[str, Any]] = self.server.get(f"/v1/jobs/{self.job}/runs").json()["items"]
         return items
+
+    def count_evaluations(self) -> int:
+        return int(self.server.get("/v1/access").json()["used"]["daily_evaluations"])
+
+    def limit_evaluations(self, most: int | None) -> None:
+        with parts_of(self.server).database.write_session() as session:
+            ProjectRepository(session).change_limits("default", {"max_daily_evaluations": most})
 
     def open_run(self, number: int) -> dict[str, Any]:
         document: dict[str, Any] = self.server.get(f"/v1/runs/{self.runs[number]}").json()
@@ -129,3 +138,43 @@ def test_what_would_take_long_is_left_as_it_was_stored(
 ) -> None:
     monkeypatch.setattr(explained, "MAX_WORK", 10)
     assert swept.open_run(1)["explained"] is False
+
+
+@pytest.fixture
+def forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was computed before is computed again."""
+    for module, name in (
+        (explained, "_explained"),
+        (bands, "_computed_bands"),
+        (fitted, "_computed_signals"),
+    ):
+        monkeypatch.setattr(module, name, ComputedValues(4))
+
+
+@pytest.mark.usefixtures("forgetful")
+@pytest.mark.parametrize(("part", "least"), [("", 30), ("/bands", 8), ("/response", 1)])
+def test_what_is_computed_to_show_a_run_counts_once(swept: Swept, part: str, least: int) -> None:
+    before = swept.count_evaluations()
+    for _ in range(2):
+        assert swept.server.get(f"/v1/runs/{swept.runs[0]}{part}").status_code == 200
+    assert least <= swept.count_evaluations() - before < 5000
+    after = swept.count_evaluations()
+    assert swept.server.get(f"/v1/runs/{swept.runs[0]}{part}").status_code == 200
+    assert swept.count_evaluations() == after
+
+
+@pytest.mark.usefixtures("forgetful")
+def test_without_evaluations_left_a_run_is_shown_as_it_was_stored(swept: Swept) -> None:
+    swept.limit_evaluations(1)
+    try:
+        address = f"/v1/runs/{swept.runs[0]}"
+        assert swept.open_run(0)["explained"] is False
+        assert swept.server.get(f"{address}/bands").status_code == 429
+        assert swept.server.get(f"{address}/response").status_code == 200
+        assert swept.server.get(f"/runs/{swept.runs[0]}").status_code == 200
+        figure = swept.server.get(f"{address}/figures/response").json()
+        assert [trace["name"] for trace in figure["data"][:2]] == ["measured", "identified"]
+    finally:
+        swept.limit_evaluations(None)
+    assert swept.open_run(0)["explained"] is True
+    assert swept.server.get(f"{address}/bands").status_code == 200

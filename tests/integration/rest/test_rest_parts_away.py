@@ -125,7 +125,7 @@ def test_uploads_at_once_are_bounded_and_each_gives_its_place_back(
 
     app = create_app(settings_of(tmp_path, max_uploads=1))
     with TestClient(app, raise_server_exceptions=False) as client:
-        places = parts_of(client).reader_places
+        places = parts_of(client).readers.places
         assert post(recording()).status_code == 201
         read_faults(post(b"no recording"), 422, "invalid-upload")
         monkeypatch.setattr(places, "_seconds", 0.1)

@@ -12,7 +12,9 @@ from typer.testing import CliRunner
 
 from service.cli import common, run_commands
 from service.client.client import Client
+from service.datasets import data_child, large_simulation
 from service.formats.mcap.mcap_files import read_mcap
+from sysid.core.child_processes import run_child
 from tests.support.library.catalogue_cases import ACTUATOR
 from tests.support.service.local_runs import identify_job
 from tests.support.service.web_app import Through, parts_of, read_faults, recording, store_csv
@@ -366,3 +368,38 @@ def test_a_lag_that_would_look_ahead_is_refused(plants: SimulatedPlants) -> None
         [fault] = read_faults(plants.server.post(path, json=given), 422, "invalid")
         assert fault["pointer"] == "/parameters/L"
         assert "found -1; with it the delay of u(t - L) can be as small as -1 s" in fault["detail"]
+
+
+def test_long_simulations_are_done_by_a_child_with_the_same_bits(
+    plants: SimulatedPlants, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    open_loop = {"inputs": {"u": {"kind": "step", "time": 1.0}}, "samples": 101, "sample_time": 0.1}
+    here = [
+        simulate_run(plants, plants.arm, LOOP),
+        simulate_run(plants, plants.lag, open_loop),
+    ]
+    children = []
+
+    def count(*args: Any, **options: Any) -> Any:
+        children.append(args[0])
+        return run_child(*args, **options)
+
+    monkeypatch.setattr(data_child, "run_child", count)
+    monkeypatch.setattr(large_simulation, "LARGE_STEPS", 1)
+    assert [
+        simulate_run(plants, plants.arm, LOOP),
+        simulate_run(plants, plants.lag, open_loop),
+    ] == here
+    body = {
+        "model": "fopdt",
+        "parameters": {"K": 2.0, "T": 1.0, "L": 0.5, "y0": 0.0},
+        "inputs": {"u": {"kind": "step", "time": 1.0}},
+        "samples": 77,
+        "sample_time": 0.1,
+    }
+    assert plants.server.post("/v1/datasets:simulate", json=body).status_code == 201
+    truth = {key: body[key] for key in ("parameters", "inputs", "sample_time")}
+    sweep = {"model": "fopdt", "truth": {**truth, "samples": 78}, "sigma": [0.1], "relative": True}
+    answer = plants.server.post("/v1/recipes/noise-sweep", json=sweep)
+    assert answer.status_code == 202, answer.text
+    assert children == ["service.datasets.simulation_child"] * 4

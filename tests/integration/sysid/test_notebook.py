@@ -83,6 +83,13 @@ def posterior_result(frame: pd.DataFrame) -> Identification:
     return identify("fopdt", parts, QUICK, parameters=FEW, validation=frame, posterior=True)
 
 
+@pytest.fixture(scope="module")
+def filtered_result(frame: pd.DataFrame) -> Identification:
+    """A result of two records with noise inside the plant."""
+    parts = [frame.iloc[:150], frame.iloc[100:]]
+    return identify("fopdt", parts, QUICK, parameters=FEW, loss=Loss(noise_model="load"))
+
+
 def same(one: Any, other: Any) -> bool:
     """Whether two results have the same numbers, bit for bit."""
     if isinstance(one, Model):
@@ -431,10 +438,24 @@ def test_the_usual_figure_has_response_residuals_correlation_and_waterfall(
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_every_figure_can_be_drawn_alone(posterior_result: Identification, name: str) -> None:
-    figure = posterior_result.plot(name, theme="dark")
+def test_every_figure_can_be_drawn_alone(
+    posterior_result: Identification, filtered_result: Identification, name: str
+) -> None:
+    found = filtered_result if name == "disturbances" else posterior_result
+    figure = found.plot(name, theme="dark")
     assert figure.data
     assert figure.layout.template.layout.font.color == "#c6ced6"
+
+
+def test_disturbances_of_every_record(filtered_result: Identification) -> None:
+    drawn = [draw_figures(filtered_result, ["disturbances"], number)[0] for number in (0, 1)]
+    assert [title for title, _ in drawn] == [
+        "Estimated disturbances: record 1",
+        "Estimated disturbances: record 2",
+    ]
+    for number, (_, figure) in enumerate(drawn):
+        (load,) = filtered_result.compute_disturbances(number)
+        assert figure["data"][-1]["y"] == pytest.approx(load.values, rel=1e-5)
 
 
 def test_figures_of_every_record(posterior_result: Identification) -> None:

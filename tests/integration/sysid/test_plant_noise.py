@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sysid.core.errors import InvalidSettings
 from sysid.core.settings import GeneticAlgorithm, Loss, Stop
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
@@ -40,7 +41,9 @@ def make_record(load: float, correlation: float, walk: float = 0.0, seed: int = 
 
 def build_record(u: FloatArray, y: FloatArray) -> Record:
     times = PERIOD * np.arange(u.size)
-    return Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y + 20.0),))
+    return Record(
+        (Channel("u", times, u, "%", hold="zero"),), (Channel("y", times, y + 20.0, "°C"),)
+    )
 
 
 def test_a_load_is_told_and_the_plant_is_found() -> None:
@@ -52,9 +55,9 @@ def test_a_load_is_told_and_the_plant_is_found() -> None:
     assert found.noise_colour == "white"
     assert found.plant_noise is not None
     sensor, load = found.plant_noise.sources
-    assert (sensor.place, sensor.kind, sensor.unit) == ("y", "sensor", "1")
+    assert (sensor.place, sensor.kind, sensor.unit) == ("y", "sensor", "°C")
     assert sensor.deviation == pytest.approx(SENSOR, rel=0.15)
-    assert (load.place, load.kind) == ("u", "load")
+    assert (load.place, load.kind, load.unit) == ("u", "load", "%")
     assert load.deviation == pytest.approx(0.1, rel=0.7)
     assert load.correlation_time == found["tau[u]"].value
     assert found.plant_noise.rms_free is not None
@@ -187,3 +190,46 @@ def test_a_result_is_saved_exported_simulated_and_drawn(tmp_path: Path) -> None:
     np.testing.assert_allclose(band.simulated, found.simulated[0][0])
     (ahead,) = found.compute_bands(record.inputs)
     np.testing.assert_allclose(ahead.simulated, simulated)
+    (load,) = found.compute_disturbances()
+    assert (load.place, load.kind) == ("u", "load")
+    assert np.all(load.band[:, 0] < load.values)
+    assert "95 % band" in {trace.name for trace in found.plot("disturbances").data}
+    assert "load at u" in str(found.plot().layout)
+    with pytest.raises(InvalidSettings, match="disturbances of 1 records"):
+        found.compute_disturbances(experiment=1)
+    white = identify("fopdt", make_record(0.0, 20.0), QUICK, loss=Loss(noise_model="white"))
+    with pytest.raises(InvalidSettings, match="no noise acts inside the plant"):
+        white.plot("disturbances")
+
+
+def test_bands_and_disturbances_of_several_outputs_are_those_of_the_fit() -> None:
+    first, second = make_record(0.1, 20.0, seed=7), make_record(0.1, 20.0, seed=8)
+    records = [
+        replace(one, outputs=(*one.outputs, Channel("z", one.outputs[0].times, size * values)))
+        for one, size in ((first, 100.0), (second, 300.0))
+        for values in [one.outputs[0].values - 20.0 + np.sin(one.outputs[0].times) / 9]
+    ]
+    model = parse_model(
+        {
+            "name": "twice",
+            "form": "differential",
+            "inputs": {"u": "1"},
+            "states": {"x": "1"},
+            "parameters": {
+                "K": {"lower": 0.2, "upper": 20},
+                "T": {"lower": 1, "upper": 60},
+                "L": {"lower": 0, "upper": 10},
+                "c": {"lower": 20, "upper": 900},
+            },
+            "equations": {"x": "(K*u(t - L) - x)/T"},
+            "outputs": {"y": "x + 20", "z": "c*x"},
+            "initial": {"x": 0},
+        }
+    )
+    found = identify(model, records, QUICK, loss=Loss(noise_model="load"))
+    for number, simulated in enumerate(found.simulated):
+        bands = found.compute_bands(experiment=number)
+        for band, values in zip(bands, simulated, strict=True):
+            np.testing.assert_allclose(band.simulated, values, rtol=1e-9)
+        (load,) = found.compute_disturbances(number)
+        assert np.isfinite(load.band).all()

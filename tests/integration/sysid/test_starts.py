@@ -8,6 +8,7 @@ from sysid.data.records import Channel, Record
 from sysid.export.export import export_model
 from sysid.identification.identify import identify
 from sysid.judgement.afterwards import explain_afterwards
+from sysid.judgement.residual_context import Simulations
 from sysid.models.catalogue.load import load_model
 from sysid.results.identification import Identification
 from sysid.simulation.problem import Problem
@@ -125,7 +126,7 @@ def test_a_sweeps_run_compares_starts_if_it_is_asked_to(data: dict[str, np.ndarr
     assert not any(one.family == "start" for one in swept.findings)
     (u, y) = (Channel(name, TIMES, data[name]) for name in ("u", "y"))
     problem = Problem.build(load_model("fopdt"), [Record((u,), (y,))])
-    opened = explain_afterwards(problem, swept)
+    opened = explain_afterwards(problem, swept, Simulations())
     [start] = [one for one in opened.findings if one.family == "start"]
     assert "(initial: rest)" in start.text
     assert start.severity == "note"  # an estimated start contains the rest, and is less exact

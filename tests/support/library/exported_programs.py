@@ -62,6 +62,56 @@ def add_entry(source: str, entry: str, inputs: int, outputs: int) -> str:
     )
 
 
+def add_observer_entry(source: str, entry: str, inputs: int, outputs: int) -> str:
+    """The C source with a function that filters signals given as arrays of arrays."""
+    stem = source.split("_identified(void)")[-2].split()[-1]
+    now = "".join(f", u[{i}][k]" for i in range(inputs))
+    compared = "".join(f", y[{i}][k], &predicted[{i}][k]" for i in range(outputs))
+    arguments = "long n, double **u, double **y, double **predicted"
+    return source + (
+        f"int {entry}({arguments});\n"
+        f"int {entry}({arguments})\n{{\n"
+        f"    const {stem}_parameters p = {stem}_identified();\n    static {stem} o;\n"
+        "    for (long k = 0; k < n; ++k) {\n"
+        f"        if (k == 0)\n            {stem}_start(&o, &p{now});\n"
+        f"        else\n            {stem}_advance(&o, &p{now});\n"
+        f"        {stem}_correct(&o, &p{compared});\n"
+        "    }\n    return 0;\n}\n"
+    )
+
+
+def observe_python(
+    source: str, inputs: Sequence[FloatArray], outputs: Sequence[FloatArray], **given: Any
+) -> list[FloatArray]:
+    """Predictions of an exported Python observer, output by output."""
+    module: dict[str, Any] = {}
+    exec(compile(source, "exported", "exec"), module)
+    observer, predicted = None, []
+    for now, measured in zip(zip(*inputs, strict=True), zip(*outputs, strict=True), strict=True):
+        if observer is None:
+            observer = module["Observer"](*now, **given)
+        else:
+            observer.advance(*now)
+        predicted.append(np.atleast_1d(observer.correct(*measured)))
+    return list(np.array(predicted).T)
+
+
+def observe_c(
+    library: ctypes.CDLL, entry: str, inputs: Sequence[FloatArray], outputs: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Predictions of an exported C observer, output by output."""
+    pointer = ctypes.POINTER(ctypes.c_double)
+    found = [np.full(y.size, np.nan) for y in outputs]
+    arrays = [
+        (pointer * len(signals))(
+            *(np.ascontiguousarray(signal).ctypes.data_as(pointer) for signal in signals)
+        )
+        for signals in (inputs, outputs, found)
+    ]
+    assert library[entry](ctypes.c_long(outputs[0].size), *arrays) == 0
+    return found
+
+
 def compile_library(folder: Path, sources: Mapping[str, str]) -> ctypes.CDLL:
     """A library of C sources, with every warning an error."""
     paths = []

@@ -46,7 +46,11 @@ class SilentProxy:
             except OSError:
                 return
             server = socket.socket(socket.AF_UNIX)
-            server.connect(self._target)
+            try:
+                server.connect(self._target)
+            except OSError:  # the server is away
+                client.close()
+                continue
             self._ends += [client, server]
             self._generation += 1
             for source, sink in ((client, server), (server, client)):

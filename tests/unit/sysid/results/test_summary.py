@@ -7,8 +7,14 @@ from sysid.residuals.residual_tests import ResidualTest, ResidualTests
 from sysid.results.findings import Finding, list_untold_reasons, note
 from sysid.results.identification import Identification
 from sysid.results.parts import NoiseSource, OrderFit, PlantNoise, compare_fits
-from sysid.results.summary import describe_order, list_evidence, summarise_result
+from sysid.results.summary import (
+    describe_order,
+    describe_predictions,
+    list_evidence,
+    summarise_result,
+)
 from sysid.results.verdict import Verdict
+from sysid.simulation.fit_metrics import PredictionError
 from tests.support.storage.run_results import conclude
 
 CAUTION = Finding("order", "structure", "caution", "the data prefer sopdt", "L is 1.3 s.", "", 30.0)
@@ -91,3 +97,27 @@ def test_sources_of_noise_stand_beside_the_free_run() -> None:
     assert f"{told} diverges" in list_evidence(
         find(plant_noise=PlantNoise((sensor, load), None, None))
     )
+
+
+def test_errors_of_predictions_lead_to_the_free_run() -> None:
+    sensor = NoiseSource("y", "sensor", 0.02, "K", None)
+    errors = tuple(
+        PredictionError(samples, 0.25 * samples, 0.02 + 0.001 * samples) for samples in (1, 2, 5)
+    )
+    noise = PlantNoise((sensor,), 0.0912, 91.04, errors)
+    told = "RMS of predictions so many samples ahead"
+    assert describe_predictions(noise, "K") == [
+        f"{told} [K]: 0.021 at 1, 0.022 at 2, 0.025 at 5, free run 0.0912"
+    ]
+    assert any(line.startswith(told) for line in list_evidence(find(plant_noise=noise)))
+    diverged = replace(noise, rms_free=None, prediction_errors=(PredictionError(1, 0.25, None),))
+    assert describe_predictions(diverged, "1") == [f"{told}: diverged at 1, free run diverged"]
+    many = tuple(PredictionError(samples, 1.0, 0.5) for samples in (1, 2, 5, 10, 20, 50, 100, 200))
+    (line,) = describe_predictions(replace(noise, prediction_errors=many), "K")
+    assert [part.split(" at ")[-1] for part in line.split(", ")[:-1]] == [
+        "1",
+        "5",
+        "20",
+        "100",
+        "200",
+    ]

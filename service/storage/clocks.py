@@ -1,4 +1,4 @@
-"""The clock of leases: one for all processes that share a database."""
+"""The clock of leases, and of starts and ends: one for all processes that share a database."""
 
 from collections.abc import Callable
 from datetime import datetime
