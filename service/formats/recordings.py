@@ -127,8 +127,9 @@ def _read_several(
         recording, told = read_with_notes(source, options)
         if len(sources) == 1:
             return recording, told
-        is_path = isinstance(source, str | os.PathLike)
-        name = Path(source).stem if is_path else f"file {number}"
+        name = f"file {number}"
+        if isinstance(source, str | os.PathLike):
+            name = Path(source).stem
         name = name if name not in recordings else f"{name} {number}"
         recordings[name] = recording
         notes += [f"{name}: {note}" for note in told]

@@ -326,7 +326,8 @@ def _build_layout(block: _DataBlock, options: ReadOptions) -> TableLayout:
         raise _build_no_table_error(block)
     cells = [row.fields for row in block.data]
     if options.columns:
-        header, units, names = block.data[0], [], list(options.columns)
+        header, names = block.data[0], list(options.columns)
+        units = list[str]()
         if len(names) == block.width - 1 and not any(row[-1].strip() for row in cells):
             names.append("")  # each row ends with a separator
         check_count(names, block.width, _may_be_times(cells))
