@@ -37,11 +37,11 @@ from service.cli.common import apply_setting
 from service.jobs.job_schemas import JobIn
 from service.jobs.to_core import read_run_settings
 from sysid.core.errors import SysidError
+from sysid.core.findings import Finding
 from sysid.core.text import rewrite_settings
 from sysid.identification.identify import identify_records
 from sysid.identification.identify_arguments import read_records
 from sysid.models.catalogue.load import resolve_model
-from sysid.results.findings import Finding
 
 SEEDS, QUICK = 10, 1
 FIRST_SEED = 71_000
@@ -209,8 +209,12 @@ def is_detectable(case: Case, found: Identification) -> bool:
         return False
     if kind.group == "dirty" or kind.detectable == "always":
         return True
-    ((fitted,),) = found.simulated
-    missed = (case.clean[-fitted.size :] - fitted) / case.noise_sd
+    records = read_records(resolve_model(case.model), case.recording, None).records
+    parts = []
+    for record, (fitted,) in zip(records, found.simulated, strict=True):
+        clean = case.clean[np.isin(case.logged["t"], record.outputs[0].times)]
+        parts.append((clean[-fitted.size :] - fitted) / case.noise_sd)
+    missed = np.concatenate(parts)
     missed = missed[np.isfinite(missed)]
     free = sum(one.is_free for one in found.parameters)
     return bool(np.sum(missed**2) - free > 10.0 + 2.0 * np.log(missed.size))

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from sysid.export.export import export_model as export_model
     from sysid.export.load_export import load_identified as load_identified
     from sysid.identification.identify import identify as identify
+    from sysid.inspection.inspect import check_recording as check_recording
     from sysid.models.catalogue.load import catalogue as catalogue
     from sysid.models.catalogue.load import load_model as load_model
     from sysid.models.parameters import Parameter as Parameter

@@ -12,12 +12,14 @@ from service.cli.common import (
     DOCUMENT_HELP,
     LISTED_ENTRIES,
     STANDARD_INPUT,
+    AsJson,
     Columns,
     FieldOrigins,
     Force,
     Limit,
     McapClock,
     Missing,
+    Quiet,
     SampleTime,
     Segments,
     check_file,
@@ -173,6 +175,51 @@ def _print_whole_dataset(stored: Mapping[str, Any]) -> None:
         for channel in stored["channels"]
     ]
     print_table(("channel", "unit", ">samples", ">missing", "hold"), rows, empty="none")
+
+
+@app.command(
+    "check",
+    epilog=show_examples(
+        "lagid dataset check recording.csv",
+        "lagid dataset check logger.txt --sample-time 0.1 --json",
+    ),
+)
+def check_dataset(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help=DATA_HELP)],
+    segments: Segments = None,
+    sample_time: SampleTime = None,
+    columns: Columns = None,
+    missing: Missing = None,
+    clock: McapClock = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Check what happened to a recording, without a model and without a server.
+
+    Gaps, stamps, repeated and coarse values, limits, means, resampled logs, changes of a unit.
+    """
+    from service.cli.identify_command import build_file_options, read_input_file
+    from sysid.core.value_documents import encode
+    from sysid.inspection.inspect import check_recording
+
+    options = build_file_options(
+        file,
+        sample_time=sample_time,
+        segments=segments,
+        columns=columns,
+        missing=missing,
+        clock=clock,
+    )
+    recording = read_input_file(file, options)
+    findings = check_recording(recording)
+    if as_json:
+        print_json([encode(finding) for finding in findings])
+        return
+    print_line(str(recording))
+    for finding in findings:
+        print_line(f"{finding.explanation}: {finding.sentences}")
+    if not findings:
+        print_line("nothing was found")
 
 
 @app.command("show", epilog=show_examples("lagid dataset show recording"))

@@ -179,18 +179,16 @@ def identify(
     data = _name_files(files)
     unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(files[0], validation)
-    from service.formats.read_options import build_options
-
-    with _report_unreadable(files[0]):
-        reading = build_options(
-            sample_time=sample_time,
-            segments=segments,
-            columns=columns,
-            missing=missing,
-            clock=clock,
-        )
+    reading = build_file_options(
+        files[0],
+        sample_time=sample_time,
+        segments=segments,
+        columns=columns,
+        missing=missing,
+        clock=clock,
+    )
     recording = read_input_files(files, reading)
-    body, loaded = check_body(unchecked, max(1, len(recording.segments)))
+    body, loaded = check_body(unchecked, _count_most_experiments(recording))
     with _report_core_faults():
         read = _extract_records(recording, data, loaded, body)
         validation_records: Sequence[Record] = ()
@@ -200,7 +198,7 @@ def identify(
             ).records
     from sysid.core.jit import announce_compilation, read_clock
 
-    printed = [*read.notes]
+    printed = [*read.notes, *_print_events(read.records)]
     begun = read_clock()
     with _report_core_faults(), announce_compilation(err.print):
         result = _run_identification(
@@ -346,6 +344,15 @@ def _refuse_same_file(data: Path, validation: Path | None) -> None:
         )
 
 
+def build_file_options(path: Path, **given: Any) -> "ReadOptions":
+    """Build the options of reading a file; end the command if one cannot be."""
+    from service.formats.read_options import build_options
+
+    with _report_unreadable(path):
+        return build_options(**given)
+    raise AssertionError  # the command has ended
+
+
 def _name_files(files: Sequence[Path]) -> Path:
     """Name the files of a recording in one: ``supply + room``."""
     if len(files) == 1:
@@ -438,6 +445,20 @@ def print_result(
     _print_posterior(result.posterior)
     _print_notes(warning for warning in result.warnings if warning not in printed)
     _print_notes(list_untold_reasons(result.parameters, result.findings))
+
+
+def _count_most_experiments(recording: "Recording") -> int:
+    """Count the experiments of a recording if all channels were inputs."""
+    from sysid.data.outages import cut_segments, find_cuts
+
+    return sum(max(len(find_cuts(one, one.names)), 1) for one in cut_segments(recording))
+
+
+def _print_events(records: "Sequence[Record]") -> list[str]:
+    """Print what happened to the recordings, and return it."""
+    events = list(dict.fromkeys(one.sentences for record in records for one in record.findings))
+    _print_notes(events)
+    return events
 
 
 def _print_notes(warnings: Iterable[str]) -> None:

@@ -69,8 +69,9 @@ def print_run(run: Mapping[str, Any], as_json: bool) -> None:
 
 
 def _list_untold_reasons(run: Mapping[str, Any]) -> list[str]:
+    from sysid.core.findings import Finding
     from sysid.core.value_documents import decode  # late: other commands start faster
-    from sysid.results.findings import Finding, list_untold_reasons
+    from sysid.results.findings import list_untold_reasons
     from sysid.uncertainty.estimates import Estimate
 
     estimates = decode(tuple[Estimate, ...], run["parameters"])

@@ -441,6 +441,14 @@ class CriteriaDocument(TypedDict):
     parameters: int
     """number D of free parameters"""
 
+class DatasetCheckDocument(TypedDict):
+    """What happened to a recording: gaps, stamps, repeated and coarse values, limits and more."""
+
+    id: str
+    """identifier of the dataset"""
+    findings: list[FindingDocument]
+    """what was found, each with its channels and where it is"""
+
 class DatasetDocument(TypedDict):
     """A stored recording."""
 
@@ -713,6 +721,10 @@ class FindingDocument(TypedDict):
     """status that these have then"""
     reason: str
     """why, as it follows the status of a parameter that has no move"""
+    channels: list[str]
+    """channels of the recording that it is about"""
+    spans: list[list[float | None]]
+    """where in the recording it is, from a time to a time (s); none if it is everywhere"""
 
 class FitPercentDocument(TypedDict):
     """Fit, 100 (1 - ‖y - ŷ‖ / ‖y - ȳ‖) %."""

@@ -134,6 +134,11 @@ class Operations(Exchange):
         return call("GET /v1/datasets/{}/signals", dataset, max_points=max_points)
 
     @fetch
+    def check_dataset(self, dataset: str) -> RestCall[documents.DatasetCheckDocument]:
+        """Fetch what happened to the recording of a dataset."""
+        return call("GET /v1/datasets/{}/check", dataset)
+
+    @fetch
     def lineage(self, dataset: str) -> RestCall[documents.LineageDocument]:
         """Fetch the lineage of a dataset: its sources, and everything made from it."""
         return call("GET /v1/datasets/{}/lineage", dataset)

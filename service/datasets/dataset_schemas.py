@@ -7,7 +7,9 @@ from pydantic import ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from service.core.bodies.derived_bodies import take_setting
+from service.core.bodies.value_schemas import describe_value
 from service.core.bodies.wire import Answer, Body, DescribedBy, Labels, Page, Seed
+from sysid.core.findings import Finding
 from sysid.data.noise import Noise
 from sysid.data.records import Hold
 
@@ -200,6 +202,10 @@ class DatasetDetailsOut(Answer):
     known_before: float | None = Field(
         default=None, description="recorded time before the start, s"
     )
+    outages: dict[str, list[tuple[float, float]]] = Field(
+        default={},
+        description="where a channel may have moved unseen, s: as an input it is cut there",
+    )
 
 
 class DatasetOut(Answer):
@@ -254,6 +260,18 @@ class SignalsOut(Answer):
     channels: list[SeriesOut] = Field(description="samples of each channel")
     history: list[SeriesOut] = Field(
         default=[], description="samples from before the start of the record"
+    )
+
+
+class DatasetCheckOut(Answer):
+    """What happened to a recording: gaps, stamps, repeated and coarse values, limits and more.
+
+    It is found without a model. An empty list is a sound recording.
+    """
+
+    id: str = Field(description="identifier of the dataset")
+    findings: Annotated[Any, DescribedBy(list[describe_value(Finding)])] = Field(
+        description="what was found, each with its channels and where it is"
     )
 
 

@@ -19,6 +19,7 @@ from service.core.process import temporary_files
 from service.core.process.concurrency import ReaderPlaces
 from service.core.settings import Settings
 from service.datasets.dataset_schemas import (
+    DatasetCheckOut,
     DatasetOut,
     DatasetPage,
     DeriveIn,
@@ -50,8 +51,11 @@ from service.storage.sessions import Database, release_connection
 from service.storage.storage_errors import ObjectDamaged, ObjectMissing, RowNotFound
 from service.storage.tables import Dataset
 from sysid.core.errors import suggest_name
+from sysid.core.value_documents import encode
+from sysid.data.outages import list_unseen
 from sysid.data.records import Channel, Recording
 from sysid.figures.decimate import decimate
+from sysid.inspection.inspect import inspect_recording
 from sysid.models.unit_checks import list_unknown_unit_warnings
 
 
@@ -288,6 +292,7 @@ def describe_recording(
             **details,
             "started_at": None if start is None else start.isoformat(),
             "warnings": [*details["warnings"], *list_unknown_unit_warnings(recording.channels)],
+            "outages": list_unseen(recording),
             "segments": [
                 {"start": s.start, "stop": s.stop, "origin": s.origin, "labels": dict(s.labels)}
                 for s in recording.segments
@@ -348,6 +353,13 @@ def read_signals(
         channels=[to_series(channel, max_points) for channel in channels],
         history=[to_series(channel, max_points) for channel in histories],
     )
+
+
+def check_dataset(session: Session, store: ObjectStore, dataset_id: str) -> DatasetCheckOut:
+    """Check what happened to the recording of a dataset."""
+    row = DatasetRepository(session).get(dataset_id)
+    findings = inspect_recording(load_recording(store, row.sha256))
+    return DatasetCheckOut(id=row.id, findings=[encode(one) for one in findings])
 
 
 def to_series(channel: Channel, max_points: int) -> SeriesOut:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from sysid.data.records import HoldSetting, Record, Recording
+from sysid.inspection.inspect import extract_inspected
 from sysid.models.model import Model
 
 
@@ -29,7 +30,7 @@ class SignalChannels:
         return dict((*self.inputs, *self.outputs))
 
     def cut_records(self, recording: Recording, name: str) -> tuple[Record, ...]:
-        """Return the records of a recording, one for each segment.
+        """Return the records of a recording, one for each segment and part between outages.
 
         Raises
         ------
@@ -37,7 +38,7 @@ class SignalChannels:
             If a channel is missing, or cannot be that signal.
         """
         held = recording.replace_holds(dict(self.holds))
-        return tuple(held.to_records(dict(self.inputs), dict(self.outputs), name))
+        return extract_inspected(held, dict(self.inputs), dict(self.outputs), name)
 
 
 def map_channels(

@@ -13,6 +13,7 @@ from sysid.data.foreign_tables import describe_value, is_labelled
 from sysid.data.joining import join_recordings
 from sysid.data.records import Recording
 from sysid.data.table_rules import tell_notes
+from sysid.inspection.inspect import check_recording
 
 
 @runtime_checkable
@@ -38,7 +39,8 @@ def read_recording(
 ) -> Recording:
     r"""Read a recording: text of columns, Excel, Parquet, NumPy, MATLAB or MCAP.
 
-    Everything that is guessed is told as a warning, `ReadingNote`. Times are in s from the start;
+    Everything that is guessed is told as a warning, `ReadingNote`. So is what happened to the
+    recording, as `check_recording` finds it. Times are in s from the start;
     the clock of the file is `Recording.started_at`.
 
     Parameters
@@ -80,7 +82,7 @@ def read_recording(
         sample_time=sample_time, segments=segments, columns=columns, missing=missing, clock=clock
     )
     recording, notes = read_with_notes(source, options)
-    tell_notes(notes)
+    tell_notes((*notes, *(one.sentences for one in check_recording(recording))))
     return recording
 
 

@@ -18,7 +18,8 @@ from service.formats.tabular.table_recordings import build_recording
 from sysid.core.child_processes import limit_resources
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
-from sysid.data.value_checks import describe_missing_values, find_infinite_value
+from sysid.data.value_checks import find_infinite_value
+from sysid.inspection.inspect import inspect_recording
 
 _OF_TABLES: Final = ("sample_time", "segments", "columns", "missing")
 
@@ -57,7 +58,7 @@ def _convert_file(task: dict[str, Any], options: ReadOptions) -> list[str]:
         write_recording(recording, task["target"])
     except ValueError as error:
         raise UnreadableFile(str(error)) from None
-    return messages
+    return [*messages, *(one.sentences for one in inspect_recording(recording))]
 
 
 def read_file(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Recording, list[str]]:
@@ -72,7 +73,9 @@ def read_file(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Recordi
         unused = [name for name in _OF_TABLES if name in options.list_given()]
         if unused:
             notes = (*notes, f"an MCAP file has times and names; not used: {', '.join(unused)}")
-        return recording, [*notes, *_check_finite_values(recording)]
+        if fault := find_infinite_value(recording.channels):
+            raise UnreadableFile(fault)
+        return recording, list(notes)
     table, messages = _read_table(path, kind, options)
     return build_recording(table, options, messages), messages
 
@@ -96,13 +99,6 @@ def _read_table(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Table
 
     read = {"numpy": read_numpy, "parquet": read_parquet}[kind]
     return read(path, options, messages), messages
-
-
-def _check_finite_values(recording: Recording) -> list[str]:
-    """Refuse infinite values; return a note for each channel with missing values."""
-    if fault := find_infinite_value(recording.channels):
-        raise UnreadableFile(fault)
-    return describe_missing_values(recording.channels)
 
 
 def _describe_error(error: UnreadableFile) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from service.core.bodies.validation import explain_errors
 from service.core.errors import FieldError, to_field_errors
 from service.datasets.datasets import resolve_dataset
 from service.jobs import warm_starts
-from service.jobs.job_parameters import count_experiments, count_named_experiments
+from service.jobs.job_parameters import count_dataset_experiments, count_named_experiments
 from service.jobs.job_schemas import JobIn
 from service.jobs.record_checks import (
     collect_faults,
@@ -70,7 +70,7 @@ class JobChecker:
         faults += self._find_term_count_faults(body, model)
         faults += _find_unused_parameters(tied, model_parameters, body["weights"])
         faults += self._find_repeated_recordings(body)
-        faults += self._find_weight_faults(body)
+        faults += self._find_weight_faults(body, model)
         faults += self._find_channel_faults(body, model)
         faults += self._find_length_faults(body, tied, model_parameters)
         faults += self._find_sample_faults(body, model, parameters)
@@ -127,21 +127,22 @@ class JobChecker:
 
         If datasets are missing, the named experiments are counted instead.
         """
-        pieces, is_complete = self._count_experiments(body)
+        pieces, is_complete = self._count_experiments(body, model)
         if not is_complete:
             pieces = max(
                 pieces, min(count_named_experiments(body["parameters"]), MAX_NAMED_EXPERIMENTS)
             )
         return (*model.parameters, *build_initial_parameters(model, pieces))
 
-    def _count_experiments(self, body: JobBody) -> tuple[int, bool]:
+    def _count_experiments(self, body: JobBody, model: Model) -> tuple[int, bool]:
         """Count the experiments of the datasets that exist; whether all do."""
         datasets = [self.get_dataset(reference) for reference in body["datasets"]]
         found = [dataset for dataset in datasets if isinstance(dataset, Dataset)]
-        return sum(map(count_experiments, found)), len(found) == len(datasets)
+        count = sum(count_dataset_experiments(one, model, body) for one in found)
+        return count, len(found) == len(datasets)
 
-    def _find_weight_faults(self, body: JobBody) -> list[FieldError]:
-        experiments, is_complete = self._count_experiments(body)
+    def _find_weight_faults(self, body: JobBody, model: Model) -> list[FieldError]:
+        experiments, is_complete = self._count_experiments(body, model)
         return list(find_weight_count_faults(body, experiments)) if is_complete else []
 
     def _count_samples(self, body: JobBody) -> int:

@@ -6,18 +6,31 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
+from service.datasets.signal_channels import map_channels
 from service.repositories.dataset_rows import DatasetRepository
 from service.storage.storage_errors import StorageError
 from service.storage.tables import Dataset
+from sysid.data.outages import count_experiments
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter
 
 _NUMBERED = re.compile(r"\(0\)\[(\d{1,6})\]$")
 
 
-def count_experiments(dataset: Dataset) -> int:
-    """Count the experiments of a dataset: its segments, or one without segments."""
-    return max(1, len(dataset.details["segments"]))
+def count_dataset_experiments(dataset: Dataset, model: Model, body: Mapping[str, Any]) -> int:
+    """Count the experiments of a dataset: its segments, cut at outages of the model's inputs."""
+    segments = dataset.details["segments"]
+    unseen = dataset.details.get("outages") or {}
+    if not unseen:
+        return max(1, len(segments))
+    measurements = [(one["start"], one["stop"]) for one in segments] or [
+        (
+            min(channel["start"] for channel in dataset.channels),
+            max(channel["stop"] for channel in dataset.channels),
+        )
+    ]
+    inputs = [channel for _, channel in map_channels(model, body["channels"]).inputs]
+    return count_experiments(unseen, measurements, inputs)
 
 
 def list_job_parameters(
@@ -31,7 +44,7 @@ def list_job_parameters(
     repository, experiments = DatasetRepository(session), 0
     for name in body["datasets"]:
         try:
-            experiments += count_experiments(repository.get(name))
+            experiments += count_dataset_experiments(repository.get(name), model, body)
         except StorageError:
             experiments += 1
     experiments = max(experiments, count_named_experiments(body["parameters"]))

@@ -9,7 +9,6 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.core.errors import BudgetExceeded, Conflict
-from service.datasets.stored_recordings import load_recording
 from service.formats.mcap.mcap_files import FitRole, FittedOutput
 from service.jobs.stored_run import StoredRun
 from service.repositories.run_rows import RunRepository
@@ -19,7 +18,6 @@ from service.runs.fitted import load_fitted_signals
 from service.runs.residuals import analyse_residuals
 from service.storage.objects import ObjectStore
 from service.storage.storage_errors import ObjectMissing, RowNotFound
-from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
 from sysid.figures.data import (
     DisturbanceTraces,
@@ -162,11 +160,6 @@ def _show_history(parameter: Parameter, points: Sequence[Improvement], column: i
     values = [point.parameters[column] for point in points]
     lower, upper = min(values), max(values)
     return replace(parameter, lower=lower, upper=upper if upper > lower else lower + 1.0)
-
-
-def read_dataset_traces(store: ObjectStore, dataset: Dataset) -> list[SignalTrace]:
-    """Read the channels of a dataset."""
-    return [to_signal_trace(channel) for channel in load_recording(store, dataset.sha256).channels]
 
 
 def read_plain_experiments(

@@ -5,6 +5,7 @@ from math import isfinite
 from typing import NamedTuple
 
 from service.pages.forms.choices import write_choice
+from sysid.core.findings import Finding
 from sysid.core.text import (
     DASH,
     append_unit,
@@ -23,7 +24,7 @@ from sysid.models.equation_display import format_equations
 from sysid.models.model import Model
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import ResidualTest
-from sysid.results.findings import Finding, list_untold_reasons
+from sysid.results.findings import list_untold_reasons
 from sysid.results.parts import NoiseSource, OrderComparison, OrderFit
 from sysid.results.result import Result
 from sysid.results.summary import describe_search

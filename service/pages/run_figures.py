@@ -7,12 +7,12 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import NotFound
 from service.datasets.rms_unit import find_rms_unit
+from service.datasets.stored_recordings import load_recording
 from service.figures.noise_figure import noise_group_keys, plot_noise_sweep
 from service.figures.trend_figure import plot_trend
 from service.jobs.stored_run import load_run
 from service.pages.figure_data import (
     StoredRunFigures,
-    read_dataset_traces,
     read_plain_experiments,
 )
 from service.pages.trend_views import load_trend
@@ -24,7 +24,8 @@ from service.sweeps.summary import summarise_job
 from sysid.figures import plotly, signal_figures
 from sysid.figures.plotly import Abscissa, Figure
 from sysid.figures.theme import Theme
-from sysid.results.figures import FigureLook, FigureName, draw_run_figure
+from sysid.inspection.inspect import inspect_recording
+from sysid.results.figures import FigureLook, FigureName, draw_run_figure, to_signal_trace
 from sysid.trends.trend import OutlierRule
 
 
@@ -142,6 +143,10 @@ def load_dataset_figure(
 ) -> Figure:
     """Draw the signals of a dataset."""
     dataset = DatasetRepository(session).get(dataset_id)
+    recording = load_recording(store, dataset.sha256)
     return signal_figures.plot_signals(
-        read_dataset_traces(store, dataset), choice.start, choice.stop
+        [to_signal_trace(channel) for channel in recording.channels],
+        choice.start,
+        choice.stop,
+        inspect_recording(recording),
     )

@@ -10,9 +10,9 @@ from service.repositories.run_rows import filter_job
 from service.storage.columns import Document
 from service.storage.sessions import find_project
 from service.storage.tables import Run
+from sysid.core.findings import Finding
 from sysid.core.value_documents import decode, list_fields
 from sysid.residuals.onset_delay import OnsetDelay
-from sysid.results.findings import Finding
 from sysid.results.result import Agreements, Result
 from sysid.uncertainty.estimates import Estimate
 

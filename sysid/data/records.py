@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.core.errors import InvalidRecord, suggest_name
+from sysid.core.findings import Finding
 from sysid.core.text import append_unit
 from sysid.core.types import BoolArray, FloatArray
 from sysid.data.foreign_tables import (
@@ -28,8 +29,8 @@ from sysid.data.holds import HOLDS as HOLDS
 from sysid.data.holds import Hold as Hold
 from sysid.data.holds import HoldChoice, choose_hold
 from sysid.data.holds import HoldSetting as HoldSetting
-from sysid.data.table_rules import TimeAxis, tell_notes
-from sysid.data.value_checks import describe_missing_values, find_infinite_value
+from sysid.data.table_rules import TimeAxis
+from sysid.data.value_checks import find_infinite_value
 
 REGULARITY_TOLERANCE = 1e-2
 """Largest deviation of regular times from a uniform grid, as a part of the period.
@@ -389,8 +390,7 @@ def _iterate_channels(group: Any, owner: str) -> Iterator[Channel]:
 def to_channel(column: Column, otherwise: str = "") -> Channel:
     """Read a column of a table as a channel; `otherwise` is its name if it has none.
 
-    What is refused or reported of a file is so of a table: infinite and missing values, and times
-    that repeat.
+    What is refused of a file is so of a table: infinite values, and times that repeat.
     """
     name, (times, start, unit) = column.name or otherwise, column.axis
     channel = Channel(name, times, column.values, column.unit, started_at=start, time_unit=unit)
@@ -403,7 +403,6 @@ def to_channel(column: Column, otherwise: str = "") -> Channel:
         )
     if fault := find_infinite_value([channel]):
         raise InvalidRecord(fault)
-    tell_notes(describe_missing_values([channel]))
     return channel
 
 
@@ -611,8 +610,8 @@ class Recording:
         Raises
         ------
         InvalidRecord
-            If a channel is missing, or is both an input and an output. If an input has missing
-            values, or an output has no value. If the recording has several segments.
+            If a channel is missing, or is both an input and an output, or has no value. If the
+            recording has several segments.
         """
         for fault in find_shared_channels(inputs, outputs).values():
             raise InvalidRecord(fault)
@@ -633,12 +632,6 @@ class Recording:
             name,
             tuple(c for c in self.channels if c.name not in {*inputs.values(), *outputs.values()}),
         )
-
-    def to_records(
-        self, inputs: Mapping[str, str], outputs: Mapping[str, str], name: str = ""
-    ) -> tuple["Record", ...]:
-        """Return every segment as one experiment, on its own times; without segments, one."""
-        return tuple(part.to_record(inputs, outputs, name) for part in self.split_segments())
 
     def split_segments(self) -> tuple["Recording", ...]:
         """Return every segment as a recording on its own times; without segments, this one.
@@ -693,14 +686,30 @@ def _shift_to_segment(channel: Channel, segment: Segment) -> Channel:
 
 
 def _to_input(channel: Channel, role: str) -> Channel:
-    missing = np.flatnonzero(~np.isfinite(channel.values))
-    if missing.size:
-        raise InvalidRecord(
-            f"input {role!r} (channel {channel.name!r}) has {missing.size} missing values (NaN), "
-            f"the first at t = {channel.times[missing[0]]:g} s. An input needs a value at every "
-            "sample. Trim the recording or fill the gaps."
-        )
-    return replace(channel, name=role, history=trim_missing_history(channel.history))
+    """Make a channel an input: samples without a value are no samples, as missing rows are none."""
+    known = select_known(channel)
+    return replace(known, name=role, history=trim_missing_history(channel.history))
+
+
+def select_known(channel: Channel) -> Channel:
+    """Return a channel without the samples that have no value; itself if all have one.
+
+    Raises
+    ------
+    InvalidRecord
+        If no sample has a value.
+    """
+    is_known = np.isfinite(channel.values)
+    if is_known.all():
+        return channel
+    if not is_known.any():
+        raise InvalidRecord(f"channel {channel.name!r} has no value: all are missing (NaN)")
+    return replace(
+        channel,
+        times=channel.times[is_known],
+        values=channel.values[is_known],
+        repeats=None if channel.repeats is None else channel.repeats[is_known],
+    )
 
 
 def trim_missing_history(history: History | None) -> History | None:
@@ -737,6 +746,8 @@ class Record:
     others : tuple of Channel
         What was recorded beside them, on the same clock. No simulation reads it, and a part of a
         record keeps all of it. Explanations of residuals look there for another input.
+    findings : tuple of Finding
+        What happened to the recording that it was made from.
 
     Examples
     --------
@@ -751,6 +762,7 @@ class Record:
     outputs: tuple[Channel, ...]
     name: str = ""
     others: tuple[Channel, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     if TYPE_CHECKING:
 
@@ -760,6 +772,7 @@ class Record:
             outputs: Channels,
             name: str = "",
             others: tuple[Channel, ...] = (),
+            findings: tuple[Finding, ...] = (),
         ) -> None: ...
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""What is wrong with the values of a channel, or missing: the same words for files and tables."""
+"""What is wrong with the values of a channel: the same words for files and tables."""
 
 from collections.abc import Iterable
 from typing import Protocol
@@ -34,17 +34,3 @@ def find_infinite_value(channels: Iterable[TimedValues]) -> str | None:
                 "values must be finite (NaN is a missing value)"
             )
     return None
-
-
-def describe_missing_values(channels: Iterable[TimedValues]) -> list[str]:
-    """Describe the missing values of each channel that has some."""
-    notes = []
-    for channel in channels:
-        missing = np.flatnonzero(np.isnan(channel.values))
-        if missing.size:
-            notes.append(
-                f"channel {channel.name!r}: {missing.size} of {channel.values.size} values are "
-                f"missing (NaN), the first at t = {channel.times[missing[0]]:g} s. An output is "
-                "not scored at missing values. An input with missing values cannot be used."
-            )
-    return notes

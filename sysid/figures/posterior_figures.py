@@ -13,12 +13,7 @@ from sysid.figures.data import Floats
 from sysid.figures.figure_grid import add_axes
 from sysid.figures.plotly import Figure, base_layout, empty_figure, to_json_numbers
 from sysid.figures.theme import stride_indices
-from sysid.uncertainty.estimates import (
-    CorrelationMatrix,
-    Estimate,
-    Posterior,
-    PosteriorParameter,
-)
+from sysid.uncertainty.estimates import CorrelationMatrix, Estimate, Posterior, PosteriorParameter
 
 MAX_SHOWN = 6
 """Parameters that a corner plot shows."""

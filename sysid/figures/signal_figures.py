@@ -6,6 +6,7 @@ from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
 
+from sysid.core.findings import Finding
 from sysid.core.text import bracket_unit, plain_unit
 from sysid.figures import theme
 from sysid.figures.data import (
@@ -20,6 +21,7 @@ from sysid.figures.theme import MAX_POINTS, thin_indices, window_slice
 
 T = TypeVar("T")
 _GAP_PX = 20
+_MOST_MARKS = 100  # of a finding in a plot
 _HISTORY_FRACTION = 0.1  # drawn input history before the record, as a share of its duration
 _OUTPUT_PX, _RESIDUAL_PX, _INPUT_PX, _SIGNAL_PX = 240, 84, 110, 120
 _DISTURBANCE_PX = 180
@@ -242,9 +244,12 @@ def signals_height(n_channels: int) -> int:
 
 
 def plot_signals(
-    channels: Sequence[SignalTrace], start: float | None = None, stop: float | None = None
+    channels: Sequence[SignalTrace],
+    start: float | None = None,
+    stop: float | None = None,
+    findings: Sequence[Finding] = (),
 ) -> Figure:
-    """Draw the channels of a dataset, one below the other."""
+    """Draw the channels of a dataset, one below the other, and mark where something happened."""
     figure = stack_plots([_SIGNAL_PX] * len(channels))
     for number, signal in enumerate(channels, 1):
         span = window_slice(signal.times, start, stop)
@@ -253,7 +258,47 @@ def plot_signals(
         figure["data"] += _history_traces(signal.history, start, stop, f"y{number}", colour)
         name_axis(figure, number, f"{signal.name}{bracket_unit(signal.unit)}")
     figure["layout"]["meta"] = {"thinned": _is_thinned(channels)}
+    numbers = {signal.name: number for number, signal in enumerate(channels, 1)}
+    marks = [
+        _mark_span(numbers[name], span, finding.explanation if position == 0 else "")
+        for finding in findings
+        for name in finding.channels
+        if name in numbers
+        for position, span in enumerate(finding.spans[:_MOST_MARKS])
+    ]
+    if marks:
+        figure["layout"]["shapes"] = [shape for shape, _ in marks]
+        figure["layout"]["annotations"] = [note for _, note in marks if note["text"]]
     return figure
+
+
+def _mark_span(
+    number: int, span: tuple[float, float], text: str
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Mark a span of time (s) in a numbered plot of a stack: its shade, and its name."""
+    axis = f"{axis_id(f'y{number}')} domain"
+    shape = {
+        "type": "rect",
+        "x0": span[0],
+        "x1": span[1],
+        "y0": 0,
+        "y1": 1,
+        "yref": axis,
+        "fillcolor": theme.MARK,
+        "line": {"width": 1, "color": theme.MARK},
+        "layer": "below",
+    }
+    note = {
+        "text": text,
+        "x": span[0],
+        "y": 1,
+        "yref": axis,
+        "xanchor": "left",
+        "yanchor": "bottom",
+        "showarrow": False,
+        "font": {"size": 11},
+    }
+    return shape, note
 
 
 def plot_disturbances(

@@ -22,6 +22,8 @@ PURPLE, OCHRE, GREY = "#b9619b", "#b5830f", "#8a929b"
 SERIES_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, OCHRE, GREY)
 SERIES_DASHES = ("solid", "dash", "dot", "dashdot")
 SHADE = "rgba(138,146,155,0.14)"
+MARK = "rgba(213,94,0,0.22)"
+"""Where something happened to a record."""
 HAIRLINE = "rgba(138,146,155,0.55)"
 DIVERGING = [[0.0, BLUE], [0.5, "rgba(138,146,155,0.10)"], [1.0, VERMILLION]]
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'DejaVu Sans', sans-serif"

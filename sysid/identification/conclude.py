@@ -8,6 +8,7 @@ from math import inf
 import numpy as np
 
 from sysid.core.errors import DivergedEverywhere, NothingIdentifiable, SysidError
+from sysid.core.findings import Finding, note
 from sysid.core.jit import read_clock
 from sysid.core.settings import FoundNoiseModel, GeneticAlgorithm, StartKind
 from sysid.core.threads import use_one_thread
@@ -53,6 +54,7 @@ from sysid.judgement.open_terms import find_open_terms
 from sysid.judgement.preparation import (
     find_early_responses,
     find_few_repeats,
+    find_record_events,
     find_unit_faults,
     find_useless_prediction,
 )
@@ -75,7 +77,6 @@ from sysid.noise_models.generalised_least_squares import resolve_noise_model
 from sysid.residuals.feedback import describe_feedback
 from sysid.residuals.onset_delay import estimate_onset_delays
 from sysid.residuals.residual_tests import list_residual_series, run_residual_tests
-from sysid.results.findings import Finding, note
 from sysid.results.identification import Identification
 from sysid.results.result import Agreements, FitPercent, Identifiability, KnownBefore
 from sysid.search.refine import refine_candidates
@@ -257,6 +258,7 @@ def _build_identification(
             *find_unit_faults(problem),
             *find_useless_prediction(problem),
             *find_few_repeats(problem, analysis),
+            *(find_record_events(problem, explanations) if compares_orders else ()),
             *_list_notes("unequal noise", describe_unequal_noise(problem, metrics.channels)),
             *_list_notes(
                 "exchange",

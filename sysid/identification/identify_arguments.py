@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from math import isfinite
 from numbers import Real
 from os import PathLike
@@ -19,6 +20,7 @@ from sysid.data.foreign_tables import (
 from sysid.data.holds import MEANS, HoldSetting
 from sysid.data.records import Channel, Record, Recording, to_channel
 from sysid.data.value_checks import find_infinite_value
+from sysid.inspection.inspect import check_recording, extract_inspected
 from sysid.models.channel_assignment import (
     Assignment,
     assign_channels,
@@ -53,7 +55,7 @@ def read_records(
 ) -> ReadRecords:
     """Read recordings as records of a model, with the given holds of its signals.
 
-    A recording of several segments gives one record for each.
+    A recording of several segments gives one record for each. So does one with outages.
 
     Raises
     ------
@@ -135,6 +137,7 @@ def _read_one(
 ) -> Iterator[tuple[Record, Assignment]]:
     if isinstance(data, Record):
         record, note = assign_record(model, data, channels)
+        record = replace(record, findings=data.findings or check_recording(data))
         pairs = zip((*record.inputs, *record.outputs), (*data.inputs, *data.outputs), strict=True)
         yield record, Assignment({named.name: channel.name for named, channel in pairs}, note)
         return
@@ -159,7 +162,7 @@ def _read_one(
         raise InvalidRecord(_describe_wrong_data(data))
     inputs = {signal.name: assigned.by_signal[signal.name] for signal in model.inputs}
     outputs = {output.name: assigned.by_signal[output.name] for output in model.outputs}
-    for record in recording.to_records(inputs, outputs):
+    for record in extract_inspected(recording, inputs, outputs):
         yield record, assigned
 
 

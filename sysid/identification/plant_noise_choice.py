@@ -15,13 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.core.errors import InvalidSettings
+from sysid.core.findings import Finding
 from sysid.core.types import FloatArray
 from sysid.judgement.unstable_run import MIN_GROWTH, compute_growth
 from sysid.minima.minima import is_same_point
 from sysid.models.kalman_filter import is_noise_parameter, list_plant_noise
 from sysid.noise_models.first_order_fit import fit_first_order_noise
 from sysid.residuals.series import iterate_parts
-from sysid.results.findings import Finding
 from sysid.search.refine import refine_candidates
 from sysid.simulation.free_run import convert_to_free_run
 from sysid.simulation.noise_levels import add_noise_levels

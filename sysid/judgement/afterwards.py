@@ -20,6 +20,7 @@ from sysid.judgement.input_hold import find_hold_doubts, find_other_readings
 from sysid.judgement.judge import Explained, explain_residuals, select_explanations
 from sysid.judgement.levels import SOLVER_SHARE
 from sysid.judgement.noise_findings import find_unexplained
+from sysid.judgement.preparation import find_record_events
 from sysid.judgement.residual_context import ResidualContext, Simulations
 from sysid.judgement.starts import compare_starts, find_open_starts
 from sysid.results.result import Result
@@ -60,10 +61,12 @@ def explain_afterwards(problem: Problem, result: Result, simulations: Simulation
     ]
     compared = [one for one in kept if one.gain is not None and one.family != "start"]
     compared += find_open_starts(starts, result.parameters)
+    answers = select_explanations(() if has_feedback else explained.findings, compared)
     findings = order_findings(
         [
             *(one for one in kept if one.gain is None),
-            *select_explanations(() if has_feedback else explained.findings, compared),
+            *answers,
+            *find_record_events(problem, answers),
         ],
         problem.n_scored,
     )

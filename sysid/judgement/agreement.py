@@ -6,12 +6,12 @@ from math import isfinite
 import numpy as np
 
 from sysid.core.distributions import chi_square_limit
+from sysid.core.findings import Finding, Severity
 from sysid.core.text import join_names
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.judgement.levels import STRONG_ODDS, UNLIKELY
 from sysid.judgement.yardstick import NOTABLE_SHARE, Yardstick, fit_reverse, fit_yardstick
-from sysid.results.findings import Finding, Severity
 from sysid.simulation.fit_metrics import ChannelMetrics, Metrics
 from sysid.simulation.problem import Problem
 

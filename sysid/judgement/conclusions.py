@@ -9,11 +9,11 @@ from dataclasses import replace
 from math import exp, log
 from typing import TYPE_CHECKING
 
+from sysid.core.findings import EstimateStatus, Finding, Severity, note
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE
-from sysid.results.findings import Finding, Severity, note
 from sysid.results.verdict import Verdict
-from sysid.uncertainty.estimates import Estimate, EstimateStatus
+from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.intervals import (
     Alternative,
     Mixture,
@@ -31,6 +31,7 @@ _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
 _OF_RECORD = (
     "constant output",
     "constant input",
+    "change of a unit",
     "exchanged channels",
     "feedback",
 )  # then nothing else says anything

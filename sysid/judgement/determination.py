@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sysid.core.findings import Finding, Severity, note
 from sysid.core.text import join_names
 from sysid.core.types import RANK_TOLERANCE
 from sysid.core.units import format_unit
@@ -12,7 +13,6 @@ from sysid.identifiability.combinations import IdentifiableCombination
 from sysid.judgement.levels import NOTABLE_MOVE, SEPARABLE
 from sysid.models.kalman_filter import is_noise_parameter
 from sysid.models.parameters import BoundSide, Parameter
-from sysid.results.findings import Finding, Severity, note
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale
 from sysid.uncertainty.estimates import Estimate, Uncertainty

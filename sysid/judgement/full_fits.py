@@ -13,13 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sysid.core.errors import SysidError
+from sysid.core.findings import Move
 from sysid.core.types import FloatArray
 from sysid.data.records import Record, keep_outputs
 from sysid.judgement.residual_context import ResidualContext, find_held, hold_noise
 from sysid.judgement.residual_model import ResidualModel
 from sysid.judgement.unrecorded_input import compute_reach
 from sysid.residuals.series import iterate_parts
-from sysid.results.findings import Move, list_moves, order_moves
+from sysid.results.findings import list_moves, order_moves
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.start_values import convert_point

@@ -9,12 +9,12 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from sysid.core.findings import Finding, note
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.language.printer import format_expression
 from sysid.language.tree import Binary, Expression, FunctionCall, PastValue, walk
 from sysid.models.model import Model
-from sysid.results.findings import Finding, note
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit, to_unit
 

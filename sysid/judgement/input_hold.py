@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sysid.core.findings import Finding, Move, note
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 from sysid.data.records import Channel, Record
@@ -24,7 +25,7 @@ from sysid.kernels.signals.past_reads import is_difference
 from sysid.residuals.feedback import find_commands
 from sysid.residuals.residual_tests import list_residual_series
 from sysid.residuals.series import iterate_parts
-from sysid.results.findings import Finding, Move, list_moves, note
+from sysid.results.findings import list_moves
 from sysid.results.parts import InputHold
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem

@@ -23,12 +23,12 @@ from math import ceil, inf, log10, sqrt
 
 import numpy as np
 
+from sysid.core.findings import Finding, note
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import RANK_TOLERANCE, FloatArray
 from sysid.core.units import format_unit
 from sysid.kernels.signals.past_reads import is_difference
 from sysid.models.model import MAX_SUBSTEPS, replace_substeps
-from sysid.results.findings import Finding, note
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import is_at_bounds, to_unit

@@ -9,6 +9,7 @@ import numpy as np
 
 from sysid.core.distributions import chi_square_limit
 from sysid.core.errors import SysidError
+from sysid.core.findings import Finding, Move
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.judgement.explanations import (
@@ -42,7 +43,6 @@ from sysid.judgement.residual_context import (
 )
 from sysid.judgement.residual_model import ColumnFit
 from sysid.kernels.signals.past_reads import is_difference
-from sysid.results.findings import Finding, Move
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.start_values import convert_point

@@ -2,13 +2,13 @@
 
 from collections.abc import Iterator, Mapping
 
+from sysid.core.findings import Finding, note
 from sysid.core.text import join_names, plain_unit
 from sysid.core.types import FloatArray
 from sysid.judgement.judge import Explained
 from sysid.judgement.levels import UNLIKELY
 from sysid.residuals.feedback import describe_feedback
 from sysid.residuals.residual_tests import ResidualTests, list_residual_series
-from sysid.results.findings import Finding, note
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 
+from sysid.core.findings import Finding
 from sysid.models.model import Model, SelectedTerm
-from sysid.results.findings import Finding
 from sysid.selection.term_odds import CERTAIN, LEAST_COVERAGE
 from sysid.uncertainty.estimates import Estimate
 

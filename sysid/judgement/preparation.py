@@ -1,9 +1,10 @@
 """Preparation: what is known of records and model before any estimate."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from sysid.core.findings import Finding, note
 from sysid.core.types import FloatArray
 from sysid.kernels.signals.past_reads import list_delayed_values
 from sysid.models.unit_checks import (
@@ -14,7 +15,6 @@ from sysid.models.unit_checks import (
 from sysid.residuals.onset_delay import find_unprompted_output
 from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.sandwich import MIN_REPEATS, count_repeats
-from sysid.results.findings import Finding, note
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 
@@ -32,6 +32,16 @@ def find_unit_faults(problem: Problem) -> tuple[Finding, ...]:
             )
         ),
     )
+
+
+def find_record_events(problem: Problem, explained: Sequence[Finding]) -> Iterator[Finding]:
+    """Find what happened to the recordings, unless it is an explanation of the residuals already.
+
+    Each recording was inspected before it was cut into experiments.
+    """
+    told = {one.explanation for one in explained}
+    events = dict.fromkeys(event for record in problem.records for event in record.findings)
+    yield from (event for event in events if event.explanation not in told)
 
 
 def find_early_responses(problem: Problem) -> Iterator[Finding]:

@@ -29,6 +29,7 @@ import numpy as np
 from sysid.control.linear_form import IdentifiedModel
 from sysid.control.process_form import recognise_process
 from sysid.core.errors import SysidError
+from sysid.core.findings import Finding, Move
 from sysid.core.settings import FitSettings, FoundNoiseModel, Loss, StartKind
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import FloatArray
@@ -42,7 +43,6 @@ from sysid.models.kalman_filter import is_noise_parameter
 from sysid.models.model import name_initial_state, replace_substeps
 from sysid.noise_models.first_order_fit import fit_first_order_noise
 from sysid.residuals.series import is_coloured, iterate_parts
-from sysid.results.findings import Finding, Move
 from sysid.results.parts import OrderComparison, OrderFit, compare_fits
 from sysid.search.refine import refine_candidates
 from sysid.simulation.free_run import convert_to_free_run

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sysid.core.errors import SysidError
+from sysid.core.findings import Family, Move
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.core.units import format_unit
@@ -23,7 +24,7 @@ from sysid.models.kalman_filter import is_noise_parameter
 from sysid.models.model import MAX_SUBSTEPS, replace_substeps
 from sysid.models.ties import collect_parameter_names
 from sysid.residuals.series import ResidualPart, iterate_parts
-from sysid.results.findings import Family, Move, order_moves
+from sysid.results.findings import order_moves
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import is_at_bounds, to_unit
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale

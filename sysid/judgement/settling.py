@@ -2,9 +2,9 @@
 
 from collections.abc import Callable, Iterator, Sequence
 
+from sysid.core.findings import Finding, note
 from sysid.core.settings import GeneticAlgorithm
 from sysid.identifiability.active_bounds import ActiveBound
-from sysid.results.findings import Finding, note
 from sysid.results.parts import SearchEvidence
 from sysid.search.island import get_island_settings
 from sysid.uncertainty.estimates import Estimate

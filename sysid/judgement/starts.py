@@ -38,6 +38,7 @@ import numpy as np
 
 from sysid.core.distributions import chi_square_limit
 from sysid.core.errors import InvalidSettings, SysidError
+from sysid.core.findings import Finding, Move
 from sysid.core.settings import InitialSetting, StartKind
 from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
@@ -48,7 +49,7 @@ from sysid.models.model import Model
 from sysid.models.starts import compares_starts, replace_starts
 from sysid.noise_models.first_order_fit import fit_first_order_noise
 from sysid.noise_models.generalised_least_squares import select_coloured_outputs
-from sysid.results.findings import Finding, Move, list_moves
+from sysid.results.findings import list_moves
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import is_at_bounds, to_unit

@@ -22,6 +22,7 @@ import numpy as np
 
 from sysid.core.distributions import f_tail
 from sysid.core.errors import InvalidRecord
+from sysid.core.findings import Finding
 from sysid.core.types import BoolArray, FloatArray
 from sysid.data.records import Channel, Record
 from sysid.judgement.levels import UNLIKELY
@@ -29,7 +30,6 @@ from sysid.kernels.signals.past_reads import list_delayed_values
 from sysid.language.functions import Interval
 from sysid.minima.minima import Fit, collect_minima, scan_parameters
 from sysid.models.model_delays import compute_longest_delay, list_past_values
-from sysid.results.findings import Finding
 from sysid.results.parts import Minimum
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.simulation.problem import Problem

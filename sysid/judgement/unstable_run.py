@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sysid.core.errors import InvalidSettings
+from sysid.core.findings import Finding
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.judgement.input_hold import replace_holds, write_hold
@@ -35,7 +36,7 @@ from sysid.models.kalman_filter import is_noise_parameter
 from sysid.noise_models.generalised_least_squares import select_coloured_outputs
 from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.series import iterate_parts
-from sysid.results.findings import Finding, list_moves
+from sysid.results.findings import list_moves
 from sysid.results.parts import InputHold
 from sysid.search.refine import refine_candidates
 from sysid.simulation.noise_levels import add_noise_levels

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.core.errors import InvalidRecord
+from sysid.core.findings import Finding, note
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.data.records import keep_outputs
 from sysid.residuals.residual_tests import ResidualTests, run_residual_tests
-from sysid.results.findings import Finding, note
 from sysid.search.refine import refine_candidates
 from sysid.simulation.fit_metrics import Metrics
 from sysid.simulation.problem import Problem, compute_metrics

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from sysid.core.errors import InvalidRecord
+from sysid.core.findings import Finding
 from sysid.core.settings import FoundNoiseModel, LossKind, PredictionKind, StartKind
 from sysid.core.text import find_rms_unit
 from sysid.core.types import FloatArray
@@ -18,7 +19,6 @@ from sysid.identifiability.combinations import IdentifiableCombination
 from sysid.models.model import Model, SelectedTerm
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import CorrelationFunction, ResidualTests
-from sysid.results.findings import Finding
 from sysid.results.parts import InputHold, OrderComparison, PlantNoise, SearchEvidence
 from sysid.results.verdict import Verdict
 from sysid.search.state import Improvement, IslandSummary, Migrant

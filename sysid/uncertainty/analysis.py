@@ -29,6 +29,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sysid.core.distributions import student_limit
+from sysid.core.findings import EstimateStatus
 from sysid.core.linear_algebra import TruncatedSvd, compute_truncated_svd
 from sysid.core.robust import estimate_deviation
 from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
@@ -49,13 +50,7 @@ from sysid.residuals.whitening import Whitening
 from sysid.simulation.loss import compute_influence, compute_loss_weight
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import is_at_bounds, is_at_limits, to_unit
-from sysid.uncertainty.estimates import (
-    Criteria,
-    Estimate,
-    EstimateStatus,
-    NoiseColour,
-    Uncertainty,
-)
+from sysid.uncertainty.estimates import Criteria, Estimate, NoiseColour, Uncertainty
 from sysid.uncertainty.intervals import CompatibleMinima, Plateau, compose_intervals
 from sysid.uncertainty.likelihood import LikelihoodModel
 from sysid.uncertainty.linear_model import LinearOutputModel, linearise_outputs

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Literal
 
+from sysid.core.findings import EstimateStatus
 from sysid.core.types import FloatArray
 from sysid.identifiability.combinations import IdentifiableCombination
 
@@ -11,19 +12,6 @@ NoiseColour = Literal["white", "first-order", "coloured", "drifting", "clustered
 IntervalEnd = Literal["lower", "upper"]
 AT_LIMIT = "it lies at its bound, a limit of the quantity"
 """Reason of an estimate that the data determine, and that a physical limit ends."""
-EstimateStatus = Literal[
-    "identified",
-    "not settled",
-    "refuted",
-    "dependent",
-    "ambiguous",
-    "group",
-    "at bound",
-    "unidentifiable",
-    "fixed",
-    "tied",
-    "unfinished",
-]
 
 
 @dataclass(frozen=True, slots=True)

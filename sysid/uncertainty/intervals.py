@@ -28,12 +28,13 @@ from typing import Protocol, get_args
 import numpy as np
 
 from sysid.core.distributions import student_limit, student_tail
+from sysid.core.findings import EstimateStatus
 from sysid.core.text import split_estimate
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.language.functions import Interval
 from sysid.models.parameters import Parameter
-from sysid.uncertainty.estimates import AT_LIMIT, Estimate, EstimateStatus, IntervalEnd
+from sysid.uncertainty.estimates import AT_LIMIT, Estimate, IntervalEnd
 
 _TAIL = 0.025  # of the distribution, beyond each end of an interval
 _POOR_SHARE = 1 / 3  # of a range: an interval around 0 that covers more says little

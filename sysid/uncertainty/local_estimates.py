@@ -5,13 +5,14 @@ from math import sqrt
 
 import numpy as np
 
+from sysid.core.findings import EstimateStatus
 from sysid.core.types import BoolArray, FloatArray
 from sysid.identifiability.combinations import IdentifiableCombination
 from sysid.language.evaluation import evaluate_expression
 from sysid.language.tree import Expression
 from sysid.models.parameters import Parameter
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.estimates import AT_LIMIT, Estimate, EstimateStatus
+from sysid.uncertainty.estimates import AT_LIMIT, Estimate
 from sysid.uncertainty.intervals import LocalInterval, compose_interval
 
 _TIE_STEP = 1e-6  # of the range: slopes of ties

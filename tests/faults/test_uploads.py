@@ -17,6 +17,7 @@ from service.formats.sandbox import read_untrusted
 from sysid.core.child_processes import run_child
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
+from sysid.inspection.inspect import check_recording
 from tests.support.files.mcap_files import json_messages, write_foreign_bytes, write_mcap_bytes
 from tests.support.limits import LIMIT_SECONDS
 
@@ -43,7 +44,7 @@ def test_a_csv_upload_is_read_with_its_notes_and_hash(tmp_path: Path) -> None:
     )
     np.testing.assert_array_equal(read.recording.channel("u").values, [0.5, np.nan, 0.25])
     assert [one.labels["n"] for one in read.recording.segments] == [1.0, 2.0]
-    assert any("missing" in note for note in read.notes)
+    assert any("n divides the file" in note for note in read.notes)
     assert read.source_sha256 == sha256(content).hexdigest()
 
 
@@ -66,7 +67,8 @@ def test_the_place_of_a_fault_comes_out_of_the_child(tmp_path: Path) -> None:
 def test_missing_values_are_said_and_infinite_ones_refused(tmp_path: Path) -> None:
     messages = json_messages("/a", {"x": 1}, {"x": float("nan")})
     read = read_untrusted(save_file(tmp_path, write_foreign_bytes(messages)))
-    assert any("'x': 1 of 2 values are missing" in note for note in read.notes)
+    (finding,) = check_recording(read.recording)
+    assert "'x': 1 of 2 values are missing" in finding.text
     infinite = write_foreign_bytes(json_messages("/a", {"x": 1}, {"x": float("inf")}))
     assert "infinite at t = 0.1 s" in read_refusal(save_file(tmp_path, infinite)).detail
 

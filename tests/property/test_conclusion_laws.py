@@ -6,6 +6,7 @@ from typing import get_args
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sysid.core.findings import EstimateStatus, Finding, Move, Severity
 from sysid.judgement.conclusions import (
     conclude_estimates,
     conclude_verdict,
@@ -13,9 +14,8 @@ from sysid.judgement.conclusions import (
     order_findings,
 )
 from sysid.judgement.levels import DEFECT_GAIN
-from sysid.results.findings import Finding, Move, Severity
 from sysid.results.verdict import Trust, Verdict
-from sysid.uncertainty.estimates import Estimate, EstimateStatus
+from sysid.uncertainty.estimates import Estimate
 
 NAMES = ("K", "T", "L")
 TRUSTS: tuple[Trust, ...] = get_args(Trust)

@@ -36,6 +36,7 @@ from service.api.routes.item_queries import (
 from service.core.root_path import to_address
 from service.datasets import datasets, simulated
 from service.datasets.dataset_schemas import (
+    DatasetCheckOut,
     DatasetOut,
     DatasetPage,
     DeriveIn,
@@ -219,6 +220,12 @@ def read_signals(
 ) -> SignalsOut:
     """Read the samples, reduced so that extremes stay visible."""
     return datasets.read_signals(session, parts.store, dataset_id, max_points)
+
+
+@router.get("/datasets/{dataset_id}/check")
+def check_dataset(dataset_id: str, session: ReadSession, parts: PartsDep) -> DatasetCheckOut:
+    """Check what happened to the recording, without a model: gaps, stamps, values, limits."""
+    return datasets.check_dataset(session, parts.store, dataset_id)
 
 
 @router.get("/datasets/{dataset_id}/lineage")

@@ -261,7 +261,7 @@ def sort_columns(source: McapChannel, clock: Clock = "log") -> SortedMessages:
     """
     log_times, published, columns = source.columns.concatenate_blocks()
     stamps, columns = split_stamps(columns)
-    clocks = {"log": log_times}
+    clocks: dict[Clock, NDArray[np.uint64]] = {"log": log_times}
     if published.size and published.all():
         clocks["publish"] = published
     if stamps is not None:

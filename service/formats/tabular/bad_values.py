@@ -172,6 +172,6 @@ def mask_markers(
         is_marker = values == marker
         count = int(np.count_nonzero(is_marker))
         values = np.where(is_marker, np.nan, values)
-        way = "" if given else f". If it is a value, give {NO_GUESS!r} as the marker of bad data"
+        way = "" if given else f". If it is a value, give missing={NO_GUESS} (--missing {NO_GUESS})"
         notes.append(f"channel {name!r}: {marker:.16g} marks {count} values as missing{way}")
     return values

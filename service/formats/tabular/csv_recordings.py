@@ -1,8 +1,8 @@
 """Text files of columns as recordings, and recordings as CSV.
 
 What a text may look like is guessed by `service.formats.tabular.table_layout`. An empty field or a
-word such as ``NA`` is a missing value and is reported. An output is not scored there, and an input
-with a missing value cannot be used. Times must increase, except from one segment to the next.
+word such as ``NA`` is a missing value. An output is not scored there, and an input is read across
+it. Times must increase, except from one segment to the next; a few rows out of order are repaired.
 Irregular times stay as they are; nothing is resampled.
 
 Repeats of a measurement are segments, placed one after another on one time axis. A recording is
@@ -42,7 +42,7 @@ def read_csv(
     -------
     recording : Recording
     notes : tuple of str
-        Notes for the user: what was guessed, missing values, irregular times.
+        Notes for the user: what was guessed, and rows out of order.
 
     Raises
     ------

@@ -217,7 +217,7 @@ def _read_unit(long: LongTable, rows: IntArray) -> str:
 
 
 def list_wide_signals(
-    table: Table, times: FloatArray, starts: IntArray, *, is_sparse: bool, notes: list[str]
+    table: Table, times: FloatArray, starts: IntArray, notes: list[str], *, is_sparse: bool
 ) -> list[Signal]:
     """List the signals that have a column of their own.
 
@@ -226,7 +226,6 @@ def list_wide_signals(
     """
     signals, crowded = [], []
     segments = _number_segments(times, starts)
-    is_sparse = is_sparse or _is_sparse(table, times, segments)
     for column, values in zip(table.columns, table.values, strict=True):
         if column.role != "value":
             continue
@@ -243,10 +242,13 @@ def list_wide_signals(
     return signals
 
 
-def _is_sparse(table: Table, times: FloatArray, segments: IntArray) -> bool:
+def has_sparse_rows(table: Table, times: FloatArray, starts: IntArray) -> bool:
     """Whether times repeat only because signals have rows of their own."""
-    steps = np.diff(times)[np.diff(segments) == 0]
-    if not np.any(steps == 0) or np.any(steps < 0):
+    segments = _number_segments(times, starts)
+    is_next = np.diff(segments, prepend=segments[:1]) == 0
+    falls = np.diff(times, prepend=times[:1]) < 0
+    segments = segments + np.cumsum(falls & is_next)  # a clock that restarts begins another one
+    if not np.any(np.diff(times)[np.diff(segments) == 0] == 0):
         return False
     gaps = []
     for column, values in zip(table.columns, table.values, strict=True):

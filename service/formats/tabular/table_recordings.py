@@ -15,6 +15,7 @@ from service.formats.tabular.cells import begins_like_number, classify_cell
 from service.formats.tabular.long_tables import (
     Signal,
     find_long_table,
+    has_sparse_rows,
     list_signals,
     list_wide_signals,
     sort_rows,
@@ -34,8 +35,8 @@ from service.formats.tabular.time_columns import (
     read_stamp_times,
 )
 from sysid.core.errors import Advice, UnreadableFile
-from sysid.core.types import FloatArray, IntArray
-from sysid.data.records import Channel, Recording, Segment, measure_sampling
+from sysid.core.types import BoolArray, FloatArray, IntArray
+from sysid.data.records import Channel, Recording, Segment
 from sysid.data.table_rules import (
     NO_NAMES,
     TimeAxis,
@@ -43,6 +44,7 @@ from sysid.data.table_rules import (
     is_index_name,
     read_number_times,
 )
+from sysid.inspection.row_order import repair_order
 
 SegmentLabels = Mapping[str, float | str]
 
@@ -98,17 +100,15 @@ def build_recording(table: Table, options: ReadOptions, notes: list[str]) -> Rec
     if long is not None:
         long, clock = sort_rows(long, clock, starts)
         table = long.table
+    has_own_rows = long is not None or has_sparse_rows(table, clock.seconds, starts)
+    if not has_own_rows and not labels and table.sample_time is None:
+        table, clock, starts = _repair_order(table, clock, notes)
     _check_left_out(table, notes)
-    times, spans = clock.seconds, tuple[Segment, ...]()
+    if not has_own_rows or (long is None and np.any(_find_falls(clock.seconds, starts))):
+        _check_order(clock.seconds, starts, table, notes)
     signals = [] if long is None else list_signals(long, notes)
-    signals += list_wide_signals(table, times, starts, is_sparse=long is not None, notes=notes)
-    is_wide = all(signal.rows.size == times.size for signal in signals)
-    if is_wide:
-        _check_order(times, starts, table, notes)
-    if labels:
-        times, spans = _build_segments(table, labels, times, starts, notes)
-    elif is_wide:
-        _report_irregular_sampling(times, notes)
+    signals += list_wide_signals(table, clock.seconds, starts, notes, is_sparse=has_own_rows)
+    times, spans = _build_segments(table, labels, clock.seconds, starts, notes)
     channels = _build_channels(signals, table, times, clock.unit, options, notes)
     return Recording(channels, spans, clock.started_at)
 
@@ -131,7 +131,6 @@ def _build_channels(
         if signal.kind == "flag":
             notes.append(f"channel {signal.name!r}: true and false were read as 1 and 0")
         _report_bad_words(signal.name, table, notes)
-        _report_missing_values(signal.name, numbers, table.rows[signal.rows], notes)
         own = times[signal.rows]
         channels.append(Channel(signal.name, own, numbers, signal.unit or "1", time_unit=time_unit))
     if not channels:
@@ -251,6 +250,12 @@ def _read_times(table: Table, time: TableColumn, tell: bool, notes: list[str]) -
 def _build_segments(
     table: Table, labels: Sequence[str], times: FloatArray, starts: IntArray, notes: list[str]
 ) -> tuple[FloatArray, tuple[Segment, ...]]:
+    if not labels:
+        return (
+            concatenate_segments(times, starts, [{}] * starts.size)
+            if starts.size > 1
+            else (times, ())
+        )
     sizes = np.diff(np.append(starts, times.size))
     singles = int(np.count_nonzero(sizes == 1))
     if starts.size > 1 and 2 * singles > starts.size:
@@ -288,6 +293,32 @@ def _parse_labels(column: ColumnValues) -> list[float | str]:
     except ValueError:
         return list(texts)
     return list(numbers) if np.isfinite(numbers).all() else list(texts)
+
+
+def _repair_order(
+    table: Table, clock: TimeAxis, notes: list[str]
+) -> tuple[Table, TimeAxis, IntArray]:
+    """Repair the order of rows, and tell how; return where each measurement begins, too."""
+
+    def are_equal(rows: IntArray) -> BoolArray:
+        same = [_are_same(values[rows], values[rows - 1]) for values in table.values]
+        return np.asarray(np.all(same, axis=0))
+
+    order = repair_order(clock.seconds, are_equal)
+    if order is None:
+        return table, clock, np.zeros(1, dtype=np.int64)
+    notes += (one.sentences for one in order.findings)
+    rows = order.rows
+    values = tuple(column[rows] for column in table.values)
+    return (
+        replace(table, values=values, rows=table.rows[rows]),
+        clock._replace(seconds=clock.seconds[rows]),
+        order.starts,
+    )
+
+
+def _are_same(values: ColumnValues, others: ColumnValues) -> BoolArray:
+    return np.asarray((values == others) | ((values != values) & (others != others)))
 
 
 def _check_order(times: FloatArray, starts: IntArray, table: Table, notes: list[str]) -> None:
@@ -342,6 +373,13 @@ def _find_label(table: Table, times: FloatArray) -> str:
     return ""
 
 
+def _find_falls(times: FloatArray, starts: IntArray) -> BoolArray:
+    """Find where times go back inside a segment."""
+    falls = np.diff(times) < 0
+    falls[starts[1:] - 1] = False
+    return falls
+
+
 def _report_repeated_times(times: FloatArray, starts: IntArray, notes: list[str]) -> None:
     shared = np.diff(times) == 0
     shared[starts[1:] - 1] = False
@@ -349,29 +387,8 @@ def _report_repeated_times(times: FloatArray, starts: IntArray, notes: list[str]
         notes.append(f"{count} samples have the same time as the previous sample of their segment")
 
 
-def _report_irregular_sampling(times: FloatArray, notes: list[str]) -> None:
-    sampling = measure_sampling(times)
-    if sampling.samples > 1 and not sampling.is_regular:
-        gaps = np.diff(times)
-        notes.append(
-            f"sampling is irregular: {gaps.min():.4g} to {gaps.max():.4g} s between samples, "
-            f"median {sampling.period:.4g} s. Each sample is used at its own time."
-        )
-
-
 def _report_bad_words(name: str, table: Table, notes: list[str]) -> None:
     found = {word: count for (column, word), count in table.bad_words.items() if column == name}
     if found:
         listed = ", ".join(f"{word!r} ({count})" for word, count in found.items())
         notes.append(f"channel {name!r}: words that mark bad values were read as missing: {listed}")
-
-
-def _report_missing_values(name: str, values: FloatArray, rows: IntArray, notes: list[str]) -> None:
-    missing = np.flatnonzero(np.isnan(values))
-    if missing.size == 0:
-        return
-    notes.append(
-        f"channel {name!r}: {missing.size} of {values.size} values are missing (empty or NaN), the "
-        f"first in row {rows[missing[0]]}. An output is not scored at missing values. "
-        "An input with missing values cannot be used."
-    )

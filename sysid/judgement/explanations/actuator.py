@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from sysid.core.findings import Family
 from sysid.core.robust import estimate_deviation
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
@@ -25,7 +26,6 @@ from sysid.judgement.residual_context import (
     ResidualContext,
 )
 from sysid.judgement.unrecorded_input import compute_reach
-from sysid.results.findings import Family
 
 _LIMITS = (0.5, 0.65, 0.8, 0.9, 0.96)  # of the span
 _PLAYS = (0.03, 0.07, 0.15, 0.3)  # of the span

@@ -13,13 +13,13 @@ from math import lgamma, log
 
 import numpy as np
 
+from sysid.core.findings import Family, Finding, Move
 from sysid.core.robust import estimate_deviation
 from sysid.core.text import join_names
 from sysid.core.types import FloatArray, IntArray
 from sysid.judgement.levels import DEFECT_GAIN, NOTABLE_MOVE, UNLIKELY_MOVE
 from sysid.judgement.residual_context import ResidualContext
 from sysid.judgement.residual_model import ColumnFit
-from sysid.results.findings import Family, Finding, Move
 
 _OUTLYING = 6.0  # robust deviations: one such innovation, and tails are looked at
 _TAIL_DEGREES = 3.0  # of Student's t

@@ -11,6 +11,8 @@ import numpy as np
 
 from sysid.core.types import BoolArray, FloatArray
 from sysid.core.units import format_unit
+from sysid.inspection.resampling import find_knots, measure_drawn
+from sysid.inspection.signal import LIMIT_SAMPLES, are_many, find_limited
 from sysid.judgement.residual_context import (
     AS_TOLD,
     CUT_THERE,
@@ -19,14 +21,13 @@ from sysid.judgement.residual_context import (
     ResidualContext,
 )
 
-_LIMIT_SAMPLES, _LIMIT_SHARE = 5, 0.02  # equal readings at an end of the range
 _HINGES = (0.0, 0.1, 0.2, 0.3)  # of the range, from its end
 _REPEATED_SHARE = 0.2  # of the samples: readings that equal the one before
 _STUCK = 10  # readings in a row that equal the one before
 _MEANS = (2, 4, 8, 16)  # samples
-_LINE_SHARE, _DRAWN_SHARE = 1e-6, 0.3  # of the range: a bend; of the samples: on lines
+_DRAWN_SHARE = 0.3  # of the samples: on lines
 """Measured with `benchmarks.judgement`, a record of each of 102 kinds: half and twice the shares of
-limits, of repeated readings and of samples on lines leave all statuses."""
+repeated readings and of samples on lines leave all statuses."""
 
 
 def propose(context: ResidualContext) -> Iterator[Candidate]:
@@ -97,11 +98,11 @@ def _propose_curves(
     low, high = float(np.min(measured[rows])), float(np.max(measured[rows]))
     for limit, side in ((high, 1.0), (low, -1.0)):
         count = int(np.count_nonzero(rows & (measured == limit)))
-        is_seen = _are_many(count, int(np.count_nonzero(rows)))
+        is_seen = are_many(count, int(np.count_nonzero(rows)))
         for hinge in _HINGES:
             level = limit - side * hinge * (high - low)
             beyond = np.where(rows, np.maximum(side * (simulated - level), 0.0), 0.0)
-            if np.count_nonzero(beyond) < _LIMIT_SAMPLES:
+            if np.count_nonzero(beyond) < LIMIT_SAMPLES:
                 continue
             readings = f"{name} is {limit:.4g}{format_unit(unit)} in {count} samples"
             yield Candidate(
@@ -126,13 +127,10 @@ def _propose_lines(context: ResidualContext, name: str, rows: BoolArray) -> Iter
     drawn, is_drawn = np.zeros(rows.size), False
     for part in context.parts:
         measured, simulated = context.measurement[part.rows], context.simulation[part.rows]
-        if part.output != name or measured.size < _LIMIT_SAMPLES:
+        if part.output != name or measured.size < LIMIT_SAMPLES:
             continue
-        bends = np.abs(np.diff(measured, 2))
-        is_knot = np.ones(measured.size, dtype=np.bool_)
-        is_knot[1:-1] = bends > _LINE_SHARE * max(float(np.ptp(measured)), 1e-300)
-        is_moving = np.concatenate([[True], np.diff(measured) != 0])
-        is_drawn |= bool(np.mean(~is_knot & is_moving) > _DRAWN_SHARE)
+        is_knot = find_knots(part.times, measured)
+        is_drawn |= measure_drawn(measured, is_knot) > _DRAWN_SHARE
         times = part.times
         drawn[part.rows] = np.interp(times, times[is_knot], simulated[is_knot]) - simulated
     if is_drawn:
@@ -157,7 +155,7 @@ def _propose_old_readings(
     for part in context.parts:
         if part.output == name:
             measured, simulated = context.measurement[part.rows], context.simulation[part.rows]
-            equal = np.concatenate([[False], np.diff(measured) == 0]) & ~_find_limited(measured)
+            equal = np.concatenate([[False], np.diff(measured) == 0]) & ~find_limited(measured)
             is_repeated |= bool(np.mean(equal) > _REPEATED_SHARE) or _count_longest(equal) >= _STUCK
             last = np.maximum.accumulate(np.where(equal, 0, np.arange(equal.size)))
             older[part.rows] = simulated[last] - simulated
@@ -189,21 +187,6 @@ def _propose_old_readings(
                 doubtful=context.delays,
                 most=TO_THE_NEXT,
             )
-
-
-def _find_limited(measured: FloatArray) -> BoolArray:
-    """Find readings at an end of the range that has many: a sensor at its limit, not an old one."""
-    limited = np.zeros(measured.size, dtype=np.bool_)
-    for limit in (np.max(measured), np.min(measured)):
-        is_there = measured == limit
-        if _are_many(int(np.count_nonzero(is_there)), measured.size):
-            limited |= is_there
-    return limited
-
-
-def _are_many(readings: int, samples: int) -> bool:
-    """Whether so many equal readings at an end of the range are those of a limit."""
-    return readings >= max(_LIMIT_SAMPLES, _LIMIT_SHARE * samples)
 
 
 def _count_longest(flags: BoolArray) -> int:

@@ -678,3 +678,15 @@ def test_a_mistake_of_a_noise_sweep_is_one_line(server: str) -> None:
         ((*NOISE, "--sigma", "0.1", "--methods", "best"), 1, "--methods: found 'best'"),
     ):
         assert expected in check_refusal(run_lagid(*words, LAGID_URL=server), code)
+
+
+def test_a_recording_is_checked_without_a_server_and_a_model(tmp_path: Path) -> None:
+    rows = [f"{k},{k % 40 // 20},{np.sin(0.1 * k):.9f}" for k in range(600) if not 200 <= k < 400]
+    (tmp_path / "gap.csv").write_text("\n".join(["t,u,y", *rows, ""]))
+    (tmp_path / "sound.csv").write_bytes(recording())
+    told = run_lagid("dataset", "check", "gap.csv", cwd=tmp_path)
+    assert told.code == 0
+    assert "outage: u and y have no value from 199 to 400 s (200 rows)" in told.stdout
+    (finding,) = json.loads(run_lagid("dataset", "check", "gap.csv", "--json", cwd=tmp_path).stdout)
+    assert finding["spans"] == [[199.0, 400.0]]
+    assert "nothing was found" in run_lagid("dataset", "check", "sound.csv", cwd=tmp_path).stdout

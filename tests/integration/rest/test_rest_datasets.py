@@ -391,3 +391,19 @@ def test_a_recorded_input_keeps_its_hold_and_comes_in_the_unit_of_the_model(
     fault = read_faults(server.post("/v1/datasets:simulate", json=body), 422, "invalid")[0]
     assert fault["pointer"] == "/inputs/u/channel"
     assert "is in kPa, but 'u' is in V" in fault["detail"]
+
+
+def test_what_happened_to_a_recording_is_told_at_once_and_on_request(
+    server: TestClient, dataset: str
+) -> None:
+    assert server.get(f"/v1/datasets/{dataset}/check").json() == {"id": dataset, "findings": []}
+    rows = [f"{k},{k % 40 // 20},{np.sin(0.1 * k):.9f}" for k in range(600) if not 200 <= k < 400]
+    content = "\n".join(["t,u,y", *rows, ""]).encode()
+    stored = server.post("/v1/datasets?name=gap", content=content, headers=CSV).json()
+    (finding,) = server.get(f"/v1/datasets/{stored['id']}/check").json()["findings"]
+    assert finding["explanation"] == "outage"
+    assert finding["channels"] == ["u", "y"]
+    assert finding["spans"] == [[199.0, 400.0]]
+    assert finding["text"] in stored["warnings"]
+    figure = server.get(f"/v1/datasets/{stored['id']}/figures/signals").json()
+    assert [shape["x0"] for shape in figure["layout"]["shapes"]] == [199.0, 199.0]

@@ -10,12 +10,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from sysid.core.findings import Finding
 from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
 from sysid.judgement.process_order import find_other_orders
-from sysid.results.findings import Finding
 from sysid.results.identification import Identification
 from sysid.results.parts import OrderComparison, OrderFit, compare_fits
 from sysid.results.summary import describe_order

@@ -28,9 +28,9 @@ from service.repositories.history_rows import HistoryPoint, MigrantPoint
 from service.repositories.run_rows import RunRepository
 from service.storage.objects import ObjectStore, open_store
 from service.storage.sessions import Database
+from sysid.core.findings import note
 from sysid.core.value_documents import encode
 from sysid.data.records import Channel, Recording
-from sysid.results.findings import note
 from tests.support.service.web_app import settings_of
 from tests.support.storage.databases import open_migrated_sqlite
 from tests.support.storage.run_results import write_result

@@ -11,6 +11,7 @@ from service.formats.read_options import ReadOptions
 from service.formats.tabular.csv_recordings import generate_csv, read_csv
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
+from sysid.inspection.inspect import check_recording
 
 
 def read_refusal(content: str | bytes, **options: object) -> UnreadableFile:
@@ -91,15 +92,17 @@ def test_a_path_is_read_like_its_content(tmp_path: Path) -> None:
 
 
 def test_irregular_times_are_kept_and_said() -> None:
-    recording, notes = read_csv(b"t,u\n0,1\n1,2\n5,3\n")
+    recording, _ = read_csv(b"t,u\n0,1\n1,2\n5,3\n")
     np.testing.assert_array_equal(recording.channel("u").times, [0, 1, 5])
-    assert any("irregular" in note for note in notes)
+    assert [one.explanation for one in check_recording(recording)] == ["irregular sampling"]
 
 
-def test_missing_values_become_nan_and_are_said_with_their_row() -> None:
-    recording, notes = read_csv(b"t,u,y\n0,1,\n1,2,NaN\n2,3,7\n")
+def test_missing_values_become_nan_and_are_said() -> None:
+    recording, _ = read_csv(b"t,u,y\n0,1,\n1,2,NaN\n2,3,7\n")
     np.testing.assert_array_equal(recording.channel("y").values, [np.nan, np.nan, 7])
-    assert any("2 of 3 values are missing" in note and "row 2" in note for note in notes)
+    (finding,) = check_recording(recording)
+    assert "2 of 3 values are missing" in finding.text
+    assert "t = 0 s" in finding.text
 
 
 def test_the_times_of_a_clock_are_counted_from_the_first() -> None:

@@ -28,6 +28,7 @@ from service.formats.tabular.text_files import open_text
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 from sysid.data.table_rules import ReadingNote
+from sysid.inspection.inspect import check_recording
 from tests.support.checkout import ROOT
 from tests.support.files.experiment_files import (
     INPUT,
@@ -268,9 +269,9 @@ def test_stamps_that_are_too_coarse_or_mixed_are_refused_with_the_way_out() -> N
 @pytest.mark.parametrize("word", ["NA", "N/A", "null", "-", "nan", "#N/A", "#DIV/0!", "None", ""])
 def test_words_of_missing_values_are_missing(word: str) -> None:
     text = ROWS.replace(f",{OUTPUT[7]:.6f}\n", f",{word}\n")
-    recording, notes = read_csv(text.encode())
+    recording, _ = read_csv(text.encode())
     assert np.flatnonzero(np.isnan(recording.channel("y").values)).tolist() == [7]
-    assert any(f"1 of {N} values are missing" in note and "row 9" in note for note in notes)
+    assert any(f"1 of {N} values are missing" in one.text for one in check_recording(recording))
 
 
 def test_true_and_false_are_numbers_and_said() -> None:

@@ -9,8 +9,8 @@ import pytest
 from service.pages.render import template_environment
 from service.pages.result_filters import describe_soundness, tabulate_explanations
 from service.pages.trend_views import FlagCount
+from sysid.core.findings import Finding, Move, note
 from sysid.residuals.residual_tests import ResidualTests
-from sysid.results.findings import Finding, Move, note
 from sysid.results.identification import Identification
 from sysid.results.parts import OrderFit, compare_fits
 from sysid.results.verdict import Verdict

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from service.pages.result_filters import list_note_texts
 from service.pages.views import format_cell
-from sysid.results.findings import note
+from sysid.core.findings import note
 from tests.support.checkout import ROOT
 from tests.support.storage.run_results import conclude
 

@@ -12,10 +12,10 @@ from service.trends.points import (
     read_onset_estimates,
     to_label_out,
 )
+from sysid.core.findings import EstimateStatus, Finding, note
 from sysid.residuals.onset_delay import OnsetDelay
-from sysid.results.findings import Finding, note
 from sysid.results.result import Agreements
-from sysid.uncertainty.estimates import Estimate, EstimateStatus
+from sysid.uncertainty.estimates import Estimate
 
 
 def make_row(run: str, x: float, cell: dict[str, Any] | None = None, **values: Any) -> TrendRow:

@@ -12,6 +12,7 @@ from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.data.derivations import derive_recording
 from sysid.data.history import INTERPOLATION_MARGIN
+from sysid.data.outages import extract_records
 from sysid.data.records import HOLDS, Channel, History, Hold, Record, Recording, Segment
 from sysid.data.splitting import split_record
 from sysid.identification.identify import identify
@@ -192,7 +193,7 @@ def make_repeats() -> Recording:
 
 def test_of_segments_only_the_one_that_is_cut_has_a_history_and_only_its_own() -> None:
     made = derive_recording(make_repeats(), [{"trim": {"start": 10.35}}])
-    first, second = made.to_records({"u": "u"}, {"y": "y"})
+    first, second = extract_records(made, {"u": "u"}, {"y": "y"})
     found = first.inputs[0].history
     assert found is not None
     np.testing.assert_array_equal(found.values, [10, 11, 12, 13])

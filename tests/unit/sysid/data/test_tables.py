@@ -15,7 +15,7 @@ import xarray as xr
 
 from sysid.core.errors import InvalidRecord
 from sysid.data.records import Channel, History, Record, Recording
-from sysid.data.table_rules import ReadingNote
+from sysid.inspection.inspect import check_recording
 
 TIMES = np.array([0.0, 0.5, 1.0, 1.75])
 VALUES = np.array([1.0, 3.0, 2.0, 5.0])
@@ -161,8 +161,7 @@ def test_a_table_is_a_recording(table: object) -> None:
 
 def test_a_table_of_polars_is_a_recording() -> None:
     table = polars.DataFrame({"when": DATES, "P1 [bar]": [1.0, None, 3.0, 4.0]})
-    with pytest.warns(ReadingNote, match="1 of 4 values are missing"):
-        recording = Recording(table.with_columns(polars.col("when").dt.replace_time_zone("CET")))
+    recording = Recording(table.with_columns(polars.col("when").dt.replace_time_zone("CET")))
     [channel] = recording.channels
     assert (channel.name, channel.unit) == ("P1", "bar")
     assert np.array_equal(channel.times, TIMES)
@@ -276,8 +275,7 @@ def test_a_recording_is_a_table_that_reads_back(start: datetime | None) -> None:
     table = Recording((y, u)).to_pandas()
     assert list(table.columns) == ["y", "u [bar]"]
     assert table.index.name == ("t" if start is None else "time")
-    with pytest.warns(ReadingNote, match="1 of 4 values are missing"):
-        again = Recording(table)
+    again = Recording(table)
     assert again.started_at == start
     assert again["u"].unit == "bar"
     assert np.array_equal(again["u"].times, TIMES)
@@ -365,8 +363,8 @@ def test_what_is_refused_in_a_file_is_refused_in_a_table(
 
 
 def test_missing_values_of_a_table_are_told_as_those_of_a_file() -> None:
-    with pytest.warns(
-        ReadingNote, match=r"'u': 2 of 4 values are missing .*, the first at t = 1 s"
-    ):
-        recording = Recording(_table(u=[0.0, np.nan, None, 0.0]))
+    recording = Recording(_table(u=[0.0, np.nan, None, 0.0]))
+    (finding,) = check_recording(recording)
+    assert "'u': 2 of 4 values are missing" in finding.text
+    assert "the first at t = 1 s" in finding.text
     assert np.isnan(recording.channels[0].values).sum() == 2

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from service.figures.csv import to_csv
+from sysid.core.findings import note
 from sysid.core.settings import LossKind
 from sysid.figures import plotly, signal_figures
 from sysid.figures.data import (
@@ -311,3 +312,13 @@ def test_a_robust_loss_is_not_called_the_rms() -> None:
 
     assert name_axes("soft-l1") == {"soft-l1 loss, as RMS [kPa]"}
     assert name_axes("squares") == {"RMS [kPa]"}
+
+
+def test_what_happened_to_a_record_is_marked_in_the_plot_of_its_channel() -> None:
+    event = replace(note("outage", "record", "silent"), channels=("y",), spans=((0.0, 0.1),))
+    u, y = make_signal(9, "u"), make_signal(9, "y")
+    layout = signal_figures.plot_signals([u, y], findings=[event])["layout"]
+    (mark,), (name,) = layout["shapes"], layout["annotations"]
+    assert (mark["x0"], mark["x1"], mark["yref"]) == (0.0, 0.1, "y2 domain")
+    assert name["text"] == "outage"
+    assert "shapes" not in signal_figures.plot_signals([u, y])["layout"]

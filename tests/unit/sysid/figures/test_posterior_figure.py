@@ -14,12 +14,7 @@ from sysid.figures.posterior_figures import (
     plot_posterior,
     posterior_height,
 )
-from sysid.uncertainty.estimates import (
-    CorrelationMatrix,
-    Estimate,
-    Posterior,
-    PosteriorParameter,
-)
+from sysid.uncertainty.estimates import CorrelationMatrix, Estimate, Posterior, PosteriorParameter
 
 
 def make_corner(

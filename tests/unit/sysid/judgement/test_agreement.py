@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sysid.core.findings import Finding, Severity
 from sysid.data.records import Channel, Record
 from sysid.judgement.agreement import (
     find_better_yardstick,
@@ -16,7 +17,6 @@ from sysid.judgement.agreement import (
 from sysid.judgement.yardstick import Yardstick
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
-from sysid.results.findings import Finding, Severity
 from sysid.simulation.fit_metrics import ChannelMetrics, Metrics
 from sysid.simulation.problem import Problem
 from tests.support.library.judged_records import (

@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import pytest
 
+from sysid.core.findings import EstimateStatus, Finding, Move, note
 from sysid.judgement.conclusions import (
     conclude_estimates,
     conclude_verdict,
     list_warnings,
     order_findings,
 )
-from sysid.results.findings import Finding, Move, note
 from sysid.results.verdict import Verdict
-from sysid.uncertainty.estimates import Estimate, EstimateStatus
+from sysid.uncertainty.estimates import Estimate
 
 LAG = Estimate("L", "s", 0.52, 0.0, 5.0, 0.01, (0.50, 0.54), "identified")
 GAIN = replace(LAG, name="K", unit="1", value=2.0)

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sysid.core.findings import Finding
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
 from sysid.judgement.validation import Validation, find_contradictions, validate_estimates
 from sysid.models.parse import parse_model
-from sysid.results.findings import Finding
 from sysid.simulation.fit_metrics import Metrics
 from sysid.simulation.problem import Problem, compute_metrics
 from tests.support.library.judged_records import (

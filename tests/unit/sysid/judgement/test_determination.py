@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sysid.core.findings import EstimateStatus, Finding
 from sysid.identifiability.active_bounds import ActiveBound
 from sysid.identifiability.combinations import IdentifiableCombination
 from sysid.judgement.determination import find_ambiguous, find_undetermined
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
-from sysid.results.findings import Finding
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
-from sysid.uncertainty.estimates import Criteria, Estimate, EstimateStatus, Uncertainty
+from sysid.uncertainty.estimates import Criteria, Estimate, Uncertainty
 from tests.support.library.judged_records import (
     FAST,
     NOISE,

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sysid.core.findings import Finding, note
 from sysid.core.settings import Loss
 from sysid.data.records import Channel, Record
 from sysid.judgement import judge
@@ -20,7 +21,6 @@ from sysid.judgement.judge import (
 from sysid.judgement.levels import DEFECT_GAIN, STRONG_ODDS
 from sysid.judgement.residual_context import Candidate, ResidualContext, Simulations
 from sysid.models.parse import parse_model
-from sysid.results.findings import Finding, note
 from sysid.uncertainty.analysis import analyse_estimate
 from tests.support.library.defects import CONSTANCY, LATE, SENSOR
 from tests.support.library.judged_records import (

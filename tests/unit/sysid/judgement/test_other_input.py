@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from sysid.core.findings import Finding
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record, Recording
 from sysid.judgement.judge import Explained, explain_residuals
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
-from sysid.results.findings import Finding
 from tests.support.library.judged_records import (
     FAST,
     FINE,

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sysid.core.findings import Finding
 from sysid.core.settings import Loss
 from sysid.data.records import Record
 from sysid.judgement.judge import Explained
@@ -17,7 +18,6 @@ from sysid.judgement.preparation import (
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
 from sysid.residuals.residual_tests import ResidualTest, ResidualTestKind, ResidualTests
-from sysid.results.findings import Finding
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import NoiseColour
 from tests.support.library.judged_records import (

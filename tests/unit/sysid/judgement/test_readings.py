@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sysid.core.findings import Finding
 from sysid.data.records import Channel, Record
 from sysid.judgement.input_hold import (
     HoldDoubt,
@@ -17,7 +18,6 @@ from sysid.judgement.input_hold import (
 from sysid.judgement.levels import DEFECT_GAIN
 from sysid.judgement.residual_context import Simulations
 from sysid.models.catalogue.load import load_model
-from sysid.results.findings import Finding
 from sysid.results.parts import InputHold
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate

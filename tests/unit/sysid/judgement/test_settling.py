@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
+from sysid.core.findings import Finding
 from sysid.core.settings import GeneticAlgorithm
 from sysid.identifiability.active_bounds import ActiveBound
 from sysid.judgement.settling import find_rough_end, find_unsettled
-from sysid.results.findings import Finding
 from sysid.results.parts import SearchEvidence
 from sysid.uncertainty.estimates import Estimate
 

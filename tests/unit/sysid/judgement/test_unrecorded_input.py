@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sysid.core.findings import Finding
 from sysid.core.settings import GeneticAlgorithm
 from sysid.data.derivations import derive_recording
 from sysid.data.records import Channel, Recording
@@ -15,7 +16,6 @@ from sysid.judgement.residual_context import ResidualContext
 from sysid.judgement.unrecorded_input import find_assumed_samples, find_unrecorded_input
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import FixedInitial, Model
-from sysid.results.findings import Finding
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate

@@ -3,8 +3,9 @@
 from dataclasses import replace
 from typing import Any
 
+from sysid.core.findings import Finding, note
 from sysid.residuals.residual_tests import ResidualTest, ResidualTests
-from sysid.results.findings import Finding, list_untold_reasons, note
+from sysid.results.findings import list_untold_reasons
 from sysid.results.identification import Identification
 from sysid.results.parts import NoiseSource, OrderFit, PlantNoise, compare_fits
 from sysid.results.summary import (

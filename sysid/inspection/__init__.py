@@ -1,0 +1,1 @@
+"""Inspection: what happened to a record before anybody fitted it; a file for each kind."""
