@@ -1741,6 +1741,8 @@ class RunDocument(TypedDict):
     """tests of the residuals"""
     onset_delays: NotRequired[list[OnsetDelayDocument] | None]
     """delay between the start of an input's and an output's change"""
+    time_unit: NotRequired[str | None]
+    """unit in which the record had its times, such as `min`. Estimates are in their own unit"""
     data_bounds: NotRequired[list[str] | None]
     """parameters whose bounds follow the data, unless given"""
     input_hold: NotRequired[list[InputHoldDocument] | None]

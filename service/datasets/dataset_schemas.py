@@ -153,6 +153,15 @@ class DeriveIn(Body):
     )
 
 
+class JoinIn(Body):
+    """Recordings of several loggers on one clock; each channel keeps its own times."""
+
+    name: str | None = Field(default=None, max_length=200, description="name of the new dataset")
+    datasets: list[str] = Field(
+        min_length=2, max_length=100, description="ids or names of the recordings"
+    )
+
+
 class ChannelOut(Answer):
     """One channel of a dataset. `sample_time` is null if the sampling is irregular.
 

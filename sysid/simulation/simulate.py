@@ -141,7 +141,7 @@ def prepare_simulation(
     if not isinstance(values, Mapping):
         model, signals, values = _restore(model, signals, values)
     check_values(model, values)
-    at, start = _choose_times(signals, times)
+    at, start, _ = _choose_times(signals, times)
     outputs = tuple(
         Channel(
             output.name,
@@ -235,7 +235,7 @@ def _choose_times(inputs: tuple[Channel, ...], times: ArrayLike | None) -> TimeA
     if times is None:
         axis = TimeAxis(inputs[0].times, start)
     else:
-        at, first = read_times(times, "the times")
+        at, first, _ = read_times(times, "the times")
         if first is not None and start is not None:
             at = at + measure_distance(first, start)
         axis = TimeAxis(at, start if inputs else first)
