@@ -198,7 +198,7 @@ def identify(
             ).records
     from sysid.core.jit import announce_compilation, read_clock
 
-    printed = [*read.notes, *_print_events(read.records)]
+    printed = [*read.notes, *_print_events((*read.records, *validation_records))]
     begun = read_clock()
     with _report_core_faults(), announce_compilation(err.print):
         result = _run_identification(
