@@ -925,6 +925,8 @@ class JobInDocument(TypedDict):
     """first samples of each output that are not scored"""
     initial: NotRequired[Literal["rest", "free", "measured", "auto"] | None]
     """where the states start: at rest under the first inputs, at estimated or at measured values. auto compares them by the data. null: as the model's document says"""
+    commands: NotRequired[list[str] | None]
+    """inputs that a controller computes from the outputs. They are read held, and noise inside the plant is looked for. null: the data tell. Empty: there is no controller"""
     algorithm: NotRequired[AlgorithmInDocument]
     """settings of the search"""
     priority: NotRequired[int]
@@ -1747,6 +1749,8 @@ class RunDocument(TypedDict):
     """parameters whose bounds follow the data, unless given"""
     input_hold: NotRequired[list[InputHoldDocument] | None]
     """how each input is read between its samples, and the estimates if it were read otherwise"""
+    commands: NotRequired[list[str] | None]
+    """inputs that a controller computes, as the request or the data say. They are read held"""
     known_before: NotRequired[KnownBeforeDocument | None]
     """recorded time before the start of each record, s"""
     search: NotRequired[SearchEvidenceDocument | None]

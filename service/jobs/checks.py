@@ -61,9 +61,8 @@ class JobChecker:
         if isinstance(resolved, list):
             return faults + resolved
         model = collect_faults(replace_starts, faults, resolved[0], body["initial"]) or resolved[0]
-        parameters = override_by_request(
-            faults, self._list_parameters(body, model), body["parameters"]
-        )
+        declared = self._list_parameters(body, model)
+        parameters = override_by_request(faults, model, declared, body)
         model_parameters = parameters[: len(model.parameters)]
         tied = apply_ties(model, collect_faults(resolve_ties, faults, model, parameters) or {})
         collect_faults(check_delays, faults, tied, model_parameters)

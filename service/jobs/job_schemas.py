@@ -274,6 +274,7 @@ class IdentificationIn(Body):
     weights: dict[str, float | list[float]] | None = take_setting(FitSettings, "weights")
     skip: int = take_setting(FitSettings, "skip")
     initial: InitialSetting | None = take_setting(FitSettings, "initial")
+    commands: list[str] | None = take_setting(FitSettings, "commands")
     algorithm: AlgorithmIn = Field(default=AlgorithmIn(), description="settings of the search")
     priority: int = Field(
         default=0, ge=-100, le=100, description="jobs of higher priority come first"

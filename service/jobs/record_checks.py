@@ -11,10 +11,16 @@ from service.core.errors import FieldError, to_field_errors
 from service.datasets.signal_channels import map_channels
 from service.jobs.to_core import read_algorithm, read_fit
 from sysid.core.errors import RecordTooShort, SysidError, suggest_name
+from sysid.core.settings import FILTERED
 from sysid.data.holds import MEANS
 from sysid.data.records import find_shared_channels
 from sysid.language.delays import has_varying_delay
-from sysid.models.channel_assignment import check_holds
+from sysid.models.channel_assignment import check_commands, check_holds
+from sysid.models.kalman_filter import (
+    check_noise_changes,
+    is_noise_parameter,
+    list_noise_parameters,
+)
 from sysid.models.model import Model
 from sysid.models.model_delays import check_record_length, compute_longest_delay, list_past_values
 from sysid.models.parameters import Parameter, override_parameters
@@ -165,6 +171,9 @@ def find_signal_faults(body: JobBody, model: Model) -> Iterator[FieldError]:
         if name in outputs and hold in MEANS:
             collect_faults(check_mean_output, faults, model, name, body["prediction"])
         yield from faults
+    unknown: list[FieldError] = []
+    collect_faults(check_commands, unknown, model, body["commands"])
+    yield from unknown
     for name, weight in (body["weights"] or {}).items():
         numbers = weight if isinstance(weight, list) else [weight]
         if name not in outputs:
@@ -199,15 +208,23 @@ def find_setting_faults(
 ) -> list[FieldError]:
     """Report faults that the model reveals: unknown names and invalid values."""
     faults = find_setting_conflicts(body)
-    override_by_request(faults, parameters, body["parameters"])
+    override_by_request(faults, model, parameters, body)
     return [*faults, *find_signal_faults(body, model)]
 
 
 def override_by_request(
-    errors: list[FieldError], parameters: tuple[Parameter, ...], changes: Mapping[str, Any]
+    errors: list[FieldError], model: Model, parameters: tuple[Parameter, ...], body: JobBody
 ) -> tuple[Parameter, ...]:
-    """Apply all valid parameter changes, and collect the faults of the others."""
-    for name, change in changes.items():
+    """Apply all valid parameter changes, and collect the faults of the others.
+
+    The parameters of a filter that the body asks for are added.
+    """
+    noise = body["loss"]["noise_model"]
+    parameters = (*parameters, *(collect_faults(list_noise_parameters, errors, model, noise) or ()))
+    for name, change in body["parameters"].items():
+        if is_noise_parameter(name) and noise not in FILTERED:
+            collect_faults(check_noise_changes, errors, [name], noise)
+            continue
         parameters = (
             collect_faults(override_parameters, errors, parameters, {name: change}) or parameters
         )

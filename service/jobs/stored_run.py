@@ -25,6 +25,7 @@ from service.repositories.run_rows import RunRepository
 from service.storage.objects import ObjectStore
 from service.storage.tables import Job, Run
 from sysid.data.records import Record
+from sysid.models.kalman_filter import is_noise_parameter
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.starts import replace_starts
@@ -141,7 +142,9 @@ class StoredRun:
 
         records = self.read_fit_records(session, store).estimation
         parameters = (*self.model.parameters, *build_initial_parameters(self.model, len(records)))
-        settings = self._read_settings(self._changes(parameters))
+        changes = self.body["parameters"]
+        noise = {name: change for name, change in changes.items() if is_noise_parameter(name)}
+        settings = self._read_settings({**self._changes(parameters), **noise})
         return Problem.from_settings(self.model, records, settings)
 
     def resimulate(
@@ -166,13 +169,15 @@ class StoredRun:
         return records, resimulate_run(model, records, settings, self.estimates, substeps, initial)
 
     def _read_settings(self, changes: Mapping[str, Any]) -> "FitSettings":
-        """Read the settings of the fit, with the noise that the result found.
+        """Read the settings of the fit, with the noise and the commands that the result found.
 
         `changes` are those of parameters.
         """
         result = self.result
         loss = {**self.body["loss"], "noise_model": result.noise_model if result else "white"}
         settings = read_fit({**self.body, "parameters": changes, "loss": loss})
+        if result is not None and result.commands:
+            settings = replace(settings, commands=result.commands)
         if result is not None and result.noise_deviations is not None:
             settings = replace(settings, deviations=result.noise_deviations)
         return settings

@@ -392,6 +392,9 @@ class FitSettings:
     deviations : tuple of tuple of float, or None
         Relative standard deviation of the noise by experiment and output, which divides the
         weight. None: all are equal.
+    commands : tuple of str, or None
+        Inputs that a controller computes from the outputs. They are read held, and noise inside the
+        plant is looked for. None: the data tell. Empty: there is no controller.
     """
 
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -402,9 +405,12 @@ class FitSettings:
     initial: InitialSetting | None = None
     scored_from: tuple[float, ...] | None = None
     deviations: tuple[tuple[float, ...], ...] | None = None
+    commands: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", dict(self.parameters))
+        if self.commands is not None:
+            object.__setattr__(self, "commands", tuple(self.commands))
         if self.weights is not None:
             object.__setattr__(self, "weights", dict(self.weights))
         check_settings(self, "")

@@ -7,7 +7,7 @@ it (`integration_step`). At last residuals that are not white get a noise model
 (`generalised_least_squares`). The champions of the paper's two methods are analysed as they are.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from typing import NamedTuple
@@ -24,6 +24,7 @@ from sysid.identifiability.exchange import (
 from sysid.identification.budget import Budget
 from sysid.identification.deadline import Deadline
 from sysid.identification.plant_noise_choice import (
+    FilteredFit,
     ReplacedRun,
     fit_filters,
     fit_first_order_criterion,
@@ -31,6 +32,7 @@ from sysid.identification.plant_noise_choice import (
 from sysid.identification.state_conversion import convert_state
 from sysid.islands.run_state import RunState
 from sysid.islands.stopping import count_restarts
+from sysid.judgement.input_hold import find_held_commands
 from sysid.judgement.integration_step import (
     HalfStep,
     can_halve_step,
@@ -44,6 +46,12 @@ from sysid.judgement.integration_step import (
 from sysid.judgement.judge import Explained, explain_if_noise, explain_residuals
 from sysid.judgement.levels import STRONG_ODDS
 from sysid.judgement.noise_findings import find_feedback
+from sysid.judgement.noise_sources import (
+    OpenSource,
+    SourceComparison,
+    name_source,
+    open_defect,
+)
 from sysid.judgement.residual_context import (
     ResidualContext,
     Simulations,
@@ -152,6 +160,8 @@ class BestEstimate:
         The search, with the parameters of `problem`.
     free_run : ReplacedRun or None
         The estimate by squares, if a filter was chosen instead.
+    sources : SourceComparison or None
+        Other sources of noise; None if they were not compared.
     """
 
     problem: Problem
@@ -164,6 +174,7 @@ class BestEstimate:
     starts: StartComparison | None
     state: RunState
     free_run: ReplacedRun | None
+    sources: SourceComparison | None
 
     @property
     def lowest_end(self) -> IslandEnd:
@@ -202,10 +213,14 @@ def find_best_estimate(
         problem, state, budget, deadline, refines=refines, compares_starts=explains
     )
     steps = _settle_steps(search)
+    if search.hold_commands():
+        steps = _settle_steps(search)
     recorded = search.compare_where_recorded()  # a noise model would hide a contradiction
     explained = search.explain(explains=explains)
     if search.use_plant_noise(explained):
         steps = _settle_steps(search)
+        if search.hold_commands():
+            steps = _settle_steps(search)
         recorded = search.compare_where_recorded()
         explained = search.explain(explains=explains)
     first, half, limit = steps
@@ -230,6 +245,7 @@ def find_best_estimate(
         search.starts,
         search.state,
         search.free_run,
+        search.sources,
     )
 
 
@@ -287,6 +303,7 @@ class _EstimateSearch:
         self._left: list[StartKind | None] = []
         self.starts: StartComparison | None = None
         self.free_run: ReplacedRun | None = None
+        self.sources: SourceComparison | None = None
         self._deadline, self._refines = deadline, refines
         is_asked = compares_starts or self._initial == "auto"
         self._compares_starts = refines and is_asked
@@ -389,6 +406,20 @@ class _EstimateSearch:
         """Continue with another start from the ends of all islands."""
         self._continue_with(best.problem, best.theta)
 
+    def hold_commands(self) -> bool:
+        """Read inputs held that a controller seems to compute, unless the request tells them."""
+        if self.problem.settings.commands is not None or not self._refines:
+            return False
+        left = self._budget.count_left(self._reserved)
+        simulations = Simulations(left, self._deadline.is_past_grace)
+        commands = find_held_commands(self.problem, self.theta, simulations)
+        self._budget.spend(simulations.spent)
+        if not commands:
+            return False
+        self.starts, self._left = None, []
+        self._continue_with(self.problem.rebuild(commands=commands, deviations=None), self.theta)
+        return True
+
     def use_plant_noise(self, explained: Explained) -> bool:
         """Take a filter if noise inside the plant is likelier than what explains the residuals.
 
@@ -403,26 +434,53 @@ class _EstimateSearch:
         ends = [one.theta for one in self.ends]
         known = (self.theta, *ends, *(one.theta for one in self._fits))
         most, late = self._budget.count_left(self._reserved), self._deadline.is_past_grace
-        found = fit_filters(problem, known, most, late)
-        if found is None:
+        filters = fit_filters(problem, known, most, late)
+        if not filters.fits:
             return False
+        found = filters.fits[0]
         first_order, spent = fit_first_order_criterion(problem, self.theta)
-        self._budget.spend(found.evaluations + spent)
+        self._budget.spend(filters.evaluations + spent)
         gain = min(explained.criterion, first_order) - found.criterion
-        if gain <= STRONG_ODDS:
-            return False
         feedback = tuple(
             find_feedback(problem, problem.predict(self.theta[None])[0], self.analysis)
         )
-        has_controller = bool(feedback) or compute_growth(problem, self.theta) >= MIN_GROWTH
-        if gain <= explained.odds and not has_controller:
-            return False
+        commands = problem.settings.commands
+        has_controller = bool(feedback or commands) or (
+            commands is None and compute_growth(problem, self.theta) >= MIN_GROWTH
+        )
+        defects = max(explained.odds, 0.0)
         values = dict(zip(problem.free_names, self.theta.tolist(), strict=True))
+        if gain <= STRONG_ODDS or (gain <= defects and not has_controller):
+            least = max(defects - STRONG_ODDS, 0.0)
+            own = found.criterion + gain
+            self.sources = SourceComparison("", values, self._list_open([found], own, least))
+            return False
+        others = self._list_open(filters.fits[1:], found.criterion, -STRONG_ODDS)
+        if gain - defects <= STRONG_ODDS and explained.findings and not has_controller:
+            others = (*others, open_defect(explained.findings[0], values, defects - gain))
+        self.sources = SourceComparison(name_source(found.problem), found.values, others)
         self.free_run = ReplacedRun(values, gain, feedback)
         self.starts, self._left = None, []
         equal = found.problem.rebuild(deviations=None)
         self._continue_with(equal, found.theta, found.sizes)
         return True
+
+    def _list_open(
+        self, fits: Sequence[FilteredFit], criterion: float, least: float
+    ) -> tuple[OpenSource, ...]:
+        """List the sources of noise that lower a criterion by more than the least."""
+        found = list[OpenSource]()
+        for one in fits:
+            gain = criterion - one.criterion
+            if gain > least:
+                analysis = analyse_estimate(one.problem, one.theta)
+                self._budget.spend(analysis.evaluations)
+                setting = f"loss: {{noise_model: {one.problem.loss.noise_model}}}"
+                stderrs = {known.name: known.stderr for known in analysis.estimates if known.stderr}
+                found.append(
+                    OpenSource(name_source(one.problem), setting, gain, one.values, stderrs)
+                )
+        return tuple(found)
 
     def _continue_with(
         self, problem: Problem, theta: FloatArray, added: Mapping[str, float] | None = None
@@ -689,11 +747,17 @@ class _EstimateSearch:
         return fits, spent
 
     def _is_doubtful(self, end: IslandEnd) -> bool:
-        """Whether the search may have missed the best minimum, a time lag's above all."""
+        """Whether the search may have missed the best minimum, a time lag's above all.
+
+        Innovations of a filter are white in any minimum, and show nothing. Nor does the search of
+        a free run that it took the place of.
+        """
         restarts = count_restarts(*self.state.champions_and_counters)
         share = _ENOUGH_SHARE * restarts.independent
-        if restarts.confirmed > share:
+        if restarts.confirmed > share and self.free_run is None:
             return False
+        if self.problem.model.corrections:
+            return True
         simulated = self.problem.predict(end.theta[None])[0]
         tests = run_residual_tests(self.problem, simulated, "estimation")
         return not is_explained(self.problem, end.rms, tests)

@@ -46,9 +46,15 @@ from sysid.judgement.judge import select_explanations
 from sysid.judgement.levels import SOLVER_SHARE
 from sysid.judgement.noise_findings import (
     find_feedback,
+    find_loop,
     find_noise_model,
     find_plant_noise,
     find_unexplained,
+)
+from sysid.judgement.noise_sources import (
+    compute_response_gain,
+    find_no_response,
+    find_open_sources,
 )
 from sysid.judgement.open_terms import find_open_terms
 from sysid.judgement.preparation import (
@@ -186,7 +192,8 @@ def _build_identification(
         budget.spend(posterior.evaluations)
     feedback = list(find_feedback(problem, simulated, analysis))
     replaced = best.free_run
-    if replaced is not None and not tests.passed:  # a filter that does not fit explains no loop
+    # A filter that does not fit explains no loop.
+    if replaced is not None and not is_explained(problem, metrics.rms, tests):
         names = tuple(one.name for one in analysis.estimates if one.is_free)
         feedback = feedback or [replace(one, parameters=names) for one in replaced.feedback]
     left, late = budget.count_left(), deadline.is_past_grace
@@ -230,6 +237,7 @@ def _build_identification(
             ],
         )
     )
+    response = compute_response_gain(problem, theta, simulations)
     findings = order_findings(
         [
             *(find_exchanged_channels(problem, simulated, metrics) if compares_orders else ()),
@@ -241,7 +249,10 @@ def _build_identification(
                 explanations,
             ),
             *find_unsettled(
-                evidence, estimates, lambda: find_cause_in_bounds(problem, theta, analysis)
+                evidence,
+                estimates,
+                lambda: find_cause_in_bounds(problem, theta, analysis),
+                is_filter=bool(problem.model.corrections),
             ),
             *find_contradictions(problem, metrics, validated, estimates),
             *find_misled_run(estimates, ahead),
@@ -255,6 +266,7 @@ def _build_identification(
             ),
             *(() if is_of_the_solver else find_unexplained(tests, explained, analysis)),
             *feedback,
+            *find_loop(problem, asked),
             *find_unit_faults(problem),
             *find_useless_prediction(problem),
             *find_few_repeats(problem, analysis),
@@ -287,6 +299,8 @@ def _build_identification(
                 if replaced is None
                 else find_plant_noise(problem, replaced.values, replaced.gain)
             ),
+            *find_no_response(problem, response, estimates),
+            *find_open_sources(best.sources, problem, estimates),
             *_list_notes(
                 "posterior", () if posterior is None else describe_posterior(posterior, estimates)
             ),
@@ -332,6 +346,7 @@ def _build_identification(
         time_unit=(*problem.records[0].inputs, *problem.records[0].outputs)[0].time_unit,
         data_bounds=tuple(p.name for p in problem.free_parameters if p.bounds is not None),
         input_hold=holds,
+        commands=problem.settings.commands or (),
         known_before=KnownBefore(
             _compute_input_history(problem),
             () if validation is None else _compute_input_history(validation),

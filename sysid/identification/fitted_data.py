@@ -32,8 +32,10 @@ def collect_fitted_data(
         else (validation_problem, result.simulated_validation)
     )
     counts = {}
-    if result.noise_model in FILTERED:
-        problem = problem.rebuild(loss=replace(problem.loss, noise_model=result.noise_model))
+    if result.noise_model in FILTERED or result.commands:
+        is_filter = result.noise_model in FILTERED
+        loss = replace(problem.loss, noise_model=result.noise_model) if is_filter else problem.loss
+        problem = problem.rebuild(loss=loss, commands=result.commands)
     if not problem.is_free_run and validation_problem is None:
         counts = count_past_output_coefficients(problem.model, problem.all_parameters)
     series = list_residual_series(

@@ -78,6 +78,9 @@ def identify(request: IdentificationRequest) -> Identification:
         Where the states start: at rest under the first inputs, at estimated or at measured values.
         ``"auto"`` compares them by the data. Default: as the model's document says, which is
         ``auto`` for processes with dead time.
+    commands : sequence of str
+        Inputs that a controller computes from the outputs: ``["u"]``. They are read held, and noise
+        inside the plant is looked for. Default: the data tell. ``[]``: there is no controller.
     validation : Record, Recording, table, or sequence of them
         Data that are not used for the estimate.
     validation_fraction : float
@@ -138,6 +141,7 @@ def identify(request: IdentificationRequest) -> Identification:
             request.weights,
             request.skip,
             request.initial,
+            commands=None if request.commands is None else tuple(request.commands),
         ),
         request,
         validation=(

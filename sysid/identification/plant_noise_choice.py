@@ -50,6 +50,13 @@ class ReplacedRun(NamedTuple):
     feedback: tuple[Finding, ...]
 
 
+class FilteredFits(NamedTuple):
+    """The fits of all filters, the likeliest first, and the simulations spent."""
+
+    fits: tuple["FilteredFit", ...]
+    evaluations: int
+
+
 class FilteredFit(NamedTuple):
     """A filter's estimate (D,), and its criterion as `ResidualModel` has that of a free run.
 
@@ -59,13 +66,16 @@ class FilteredFit(NamedTuple):
     problem: Problem
     theta: FloatArray
     criterion: float
-    evaluations: int
 
     @property
     def sizes(self) -> dict[str, float]:
         """Values of the parameters of the noise."""
-        values = zip(self.problem.free_names, self.theta.tolist(), strict=True)
-        return {name: value for name, value in values if is_noise_parameter(name)}
+        return {name: value for name, value in self.values.items() if is_noise_parameter(name)}
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Values of all parameters."""
+        return dict(zip(self.problem.free_names, self.theta.tolist(), strict=True))
 
 
 def fit_filters(
@@ -73,26 +83,25 @@ def fit_filters(
     points: Sequence[FloatArray],
     max_simulations: int | None,
     is_late: Callable[[], bool],
-) -> FilteredFit | None:
-    """Fit the filters of a free run's model from its minima (D,), and return the likeliest.
+) -> FilteredFits:
+    """Fit the filters of a free run's model from its minima (D,).
 
-    None if the document names no place of noise, if no filter can be built on the samples, or if
-    budget or time do not suffice.
+    There are none if the document names no place of noise, if no filter can be built on the
+    samples, or if budget or time do not suffice.
     """
     most = _MOST_SIMULATIONS if max_simulations is None else max_simulations
     distinct: list[FloatArray] = []
     for point in points:
         if not any(is_same_point(problem, point, other) for other in distinct):
             distinct.append(point)
-    found: list[FilteredFit] = []
+    found, spent = list[FilteredFit](), 0
     for noise in list_plant_noise(problem.model):
         with suppress(InvalidSettings):  # no derivative, or samples off the grid
             filtered = problem.rebuild(loss=replace(problem.loss, noise_model=noise))
             if not is_late():
-                found += _fit_filter(problem, filtered, distinct, most, is_late)
-    spent = sum(one.evaluations for one in found)
-    best = min(found, key=lambda one: one.criterion, default=None)
-    return None if best is None else best._replace(evaluations=spent)
+                fits = _fit_filter(problem, filtered, distinct, most, is_late)
+                found, spent = [*found, *fits.fits], spent + fits.evaluations
+    return FilteredFits(tuple(sorted(found, key=lambda one: one.criterion)), spent)
 
 
 def _fit_filter(
@@ -101,7 +110,7 @@ def _fit_filter(
     points: Sequence[FloatArray],
     most: int,
     is_late: Callable[[], bool],
-) -> list[FilteredFit]:
+) -> FilteredFits:
     """Fit one filter; no fit if nothing is finite, or if the budget does not suffice."""
     starts, spent = list[tuple[float, FloatArray]](), 0
     for point in points:
@@ -118,13 +127,13 @@ def _fit_filter(
     ends = refine_candidates(filtered, chosen, most - spent, is_late) if chosen else ()
     known = [one for one in ends if one is not None]
     if not known:
-        return []
+        return FilteredFits((), spent)
     best = min(known, key=lambda one: one.rms)
     spent += sum(one.evaluations for one in known)
     if _is_unstable_drift(filtered, best.theta):
-        return []
+        return FilteredFits((), spent)
     criterion = _compute_criterion(filtered, best.theta, len(problem.free_parameters))
-    return [FilteredFit(filtered, best.theta, criterion, spent)]
+    return FilteredFits((FilteredFit(filtered, best.theta, criterion),), spent)
 
 
 def _is_unstable_drift(filtered: Problem, theta: FloatArray) -> bool:

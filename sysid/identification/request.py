@@ -50,6 +50,7 @@ class IdentificationRequest(RunOptions):
     weights: Weights | None = _FIT.weights
     skip: int = _FIT.skip
     initial: InitialSetting | None = _FIT.initial
+    commands: Sequence[str] | None = _FIT.commands
     validation: Data | Sequence[Data] | None = None
     progress: Callable[[RunState], None] | None = None
 
@@ -88,6 +89,7 @@ _KINDS: Mapping[str, tuple[tuple[Any, ...], str]] = {
     "settings": ((GeneticAlgorithm,), "GeneticAlgorithm(…), or None for its defaults"),
     "loss": ((Loss,), "Loss(…), such as Loss('soft-l1', scale=0.5)"),
     "noise": ((Noise,), "Noise(…), such as Noise(sigma=0.1)"),
+    "commands": ((list, tuple), "a list of inputs, such as ['u']"),
     "seed": ((Integral,), "a whole number"),
     "skip": ((Integral,), "a number of samples"),
     "weights": (

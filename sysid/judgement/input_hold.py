@@ -143,6 +143,40 @@ def find_hold_doubts(
     return doubts
 
 
+def find_held_commands(
+    problem: Problem, theta: FloatArray, simulations: Simulations
+) -> tuple[str, ...]:
+    """Find inputs in straight lines that follow the residuals as held commands do, at (D,).
+
+    The likelihood hardly tells both readings apart, because a lag takes half a sample. So a command
+    is read held unless the data clearly speak against it.
+    """
+    open_holds = {
+        hold.input: hold
+        for hold in list_input_holds(problem)
+        if hold.chosen == "first" and hold.other is not None
+    }
+    if not open_holds:
+        return ()
+    series = list_residual_series(problem, problem.predict(theta[None])[0])
+    commands = find_commands(series, is_clear=problem.is_free_run)
+    followers = [hold for name, hold in open_holds.items() if name in commands]
+    most, late = simulations.most, simulations.is_late
+    refitted, spent = refit_other_holds(problem, followers, theta, theta, most, late)
+    simulations.spent += spent
+    (rms,) = problem.evaluate_fitness(theta[None])
+    found = list[str]()
+    for hold in refitted:
+        gain = _compute_evidence(hold, problem.n_scored, float(rms))
+        if hold.rms_other is None or not simulations.allow(4 * theta.size + 4):
+            continue
+        if problem.is_free_run:  # coloured; that of a filter has its noise already
+            gain = _compute_gain(problem, hold, theta, simulations, gain)
+        if gain >= -DEFECT_GAIN:
+            found.append(hold.input)
+    return tuple(found)
+
+
 def replace_holds(problem: Problem, holds: Sequence[InputHold]) -> Problem:
     """Replace each of these holds that the data chose by the other one."""
     records = list(problem.records)

@@ -14,9 +14,13 @@ from sysid.uncertainty.analysis import Analysis
 
 
 def find_feedback(problem: Problem, simulated: FloatArray, analysis: Analysis) -> Iterator[Finding]:
-    """Find feedback from outputs to inputs; with white residuals it does no harm."""
+    """Find feedback from outputs to inputs, unless there is no controller.
+
+    With white residuals it does no harm.
+    """
     uncertainty = analysis.uncertainty
-    if uncertainty is not None and uncertainty.noise_colour == "white":
+    is_white = uncertainty is not None and uncertainty.noise_colour == "white"
+    if is_white or problem.settings.commands == ():
         return
     for text in describe_feedback(list_residual_series(problem, simulated)):
         yield Finding(
@@ -26,6 +30,20 @@ def find_feedback(problem: Problem, simulated: FloatArray, analysis: Analysis) -
             "the input follows the output: a closed loop without excitation",
             text,
             parameters=tuple(one.name for one in analysis.estimates if one.is_free),
+        )
+
+
+def find_loop(problem: Problem, asked: Problem) -> Iterator[Finding]:
+    """Find what was assumed because a controller computes inputs, which nobody `asked` for."""
+    commands = problem.settings.commands
+    if not commands or asked.settings.commands is not None:
+        return
+    for name in commands:
+        yield note(
+            "closed loop",
+            "record",
+            f"{name} follows the residuals as the command of a controller does, so it is read "
+            f"held. If there is no controller, use hold: {{{name}: first}}.",
         )
 
 

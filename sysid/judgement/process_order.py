@@ -22,7 +22,7 @@ held there (`ResidualContext.residual_model`), else its order would gain by a po
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -255,8 +255,7 @@ def _read_assumptions(
 ) -> _Assumptions | None:
     if not _has_comparable_loss(problem):
         return None
-    pairs = zip(problem.free_names, theta.tolist(), strict=True)
-    sizes = tuple(value for name, value in pairs if is_noise_parameter(name))
+    sizes = tuple(v for name, v in _list_values(problem, theta) if is_noise_parameter(name))
     problem, theta = convert_to_free_run(problem, theta)
     delays = find_delay_parameters(problem)
     process = _recognise(problem, theta)
@@ -299,11 +298,16 @@ def _changes_dynamics(process: Process, other: Process) -> bool:
     return (process.delay, process.time_constants) != (other.delay, other.time_constants)
 
 
-def _recognise(problem: Problem, theta: FloatArray) -> Process | None:
+def _list_values(problem: Problem, theta: FloatArray) -> list[tuple[str, float]]:
+    """List all parameters with their values at an estimate (D,)."""
     values = problem.evaluator.template.copy()
     values[problem.evaluator.free_rows] = theta
     names = (parameter.name for parameter in problem.all_parameters)
-    numbers = dict(zip(names, values.tolist(), strict=True))
+    return list(zip(names, values.tolist(), strict=True))
+
+
+def _recognise(problem: Problem, theta: FloatArray) -> Process | None:
+    numbers = dict(_list_values(problem, theta))
     return recognise_process(IdentifiedModel.from_numbers(problem.model, numbers))
 
 
@@ -344,11 +348,19 @@ def _build_problem(problem: Problem, entry: ProcessEntry, assumptions: _Assumpti
         for record in problem.records
     ]
     delay, process = assumptions.delay, assumptions.process
-    changes: dict[str, dict[str, float]] = {"L": {"lower": delay.lower, "upper": delay.upper}}
+    changes: dict[str, dict[str, Any]] = {"L": {"lower": delay.lower, "upper": delay.upper}}
     for what, name in (("gain", "K"), ("offset", "y0")):
         value = getattr(process, what)
         if what in assumptions.fixed and any(p.name == name for p in model.parameters):
             changes[name] = {"fixed": value, "lower": value - 1.0, "upper": value + 1.0}
+    places = {
+        problem.model.inputs[0].name: model.inputs[0].name,
+        problem.model.outputs[0].name: model.outputs[0].name,
+    }
+    for name, fields in problem.settings.parameters.items():
+        if is_noise_parameter(name):
+            kind, _, place = name[:-1].partition("[")
+            changes[f"{kind}[{places[place]}]"] = dict(fields)
     settings = FitSettings(
         changes,
         loss=Loss(noise_model=_get_filter(problem)),
@@ -391,7 +403,8 @@ def _to_theta(
     `sizes` are those of its noise, as the filter has them.
     """
     values = dict(entry.to_parameters(process))
-    values |= zip(filter(is_noise_parameter, problem.free_names), sizes, strict=True)
+    names = [one.name for one in problem.all_parameters if is_noise_parameter(one.name)]
+    values |= zip(names, sizes, strict=True)
     for number, record in enumerate(problem.records):
         measured = record.outputs[0].values
         first = float(measured[np.isfinite(measured)][0]) - process.offset

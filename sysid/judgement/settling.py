@@ -16,10 +16,13 @@ def find_unsettled(
     evidence: SearchEvidence,
     estimates: Sequence[Estimate],
     holding: Callable[[], Sequence[ActiveBound]] = tuple,
+    *,
+    is_filter: bool = False,
 ) -> Iterator[Finding]:
     """Find a search that did not settle: nothing shows that its minimum is the best.
 
-    `holding` finds the bounds that are the cause, if some are.
+    `holding` finds the bounds that are the cause, if some are. Residuals beside a filter
+    (`is_filter`) are no evidence.
     """
     if evidence.settled:
         return
@@ -29,6 +32,8 @@ def find_unsettled(
         else f"{evidence.agreeing_starts} of {evidence.independent_starts} independent starts "
         "ended in the best minimum"
     )
+    white = "the residuals are not noise"
+    residuals = "a filter leaves noise in any minimum" if is_filter else white
     bounds = holding()
     cause = f" Bounds are the cause: {', '.join(map(str, bounds))}." if bounds else ""
     yield Finding(
@@ -36,8 +41,8 @@ def find_unsettled(
         "search",
         "serious",
         "not settled",
-        f"the search did not settle: {agreed}, and the residuals are not noise. A better minimum "
-        f"may have been missed, or the model is wrong.{cause}",
+        f"the search did not settle: {agreed}, and {residuals}. A better minimum may have been "
+        f"missed, or the model is wrong.{cause}",
         "Repeat the search with another seed, more generations or other bounds, and compare the "
         "RMS.",
         parameters=tuple(one.name for one in estimates if one.is_free),

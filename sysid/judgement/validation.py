@@ -86,8 +86,9 @@ def simulate_validation(
     is_part = validation.settings.scored_from is not None
     # Other records may start otherwise, if the data were to tell how the fitted ones start.
     initial = (estimation if is_part else validation).settings.initial
-    if validation.loss != estimation.loss:
-        validation = validation.rebuild(loss=estimation.loss)  # a noise model was chosen
+    loss, commands = estimation.loss, estimation.settings.commands
+    if (validation.loss, validation.settings.commands) != (loss, commands):  # they were chosen
+        validation = validation.rebuild(loss=loss, commands=commands)
     declared = validation.model.parameters
     shared = {p.name for p in (validation.all_parameters if is_part else declared)}
     fixed = {e.name: _to_fixed_parameter(e) for e in estimates if e.name in shared}

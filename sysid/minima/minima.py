@@ -34,6 +34,7 @@ from sysid.uncertainty.linear_model import LinearOutputModel
 
 _DELAY_POINTS, _POINTS = 128, 16  # of a scan: over the range of a time lag, of another parameter
 _STARTS, _STARTS_IN_DOUBT = 6, 12  # dips from which least squares continues, in a round
+_ENOUGH_ENDS = 2  # of least squares in the best minimum of a filter: it is found then
 _TRIAL_STEPS, _MAX_STEPS = 4, 60  # of least squares from each, and from a promising one
 _PROMISING = 1.5  # times the RMS of the best: least squares continues below it
 _MAX_ROUNDS = 4
@@ -111,10 +112,10 @@ def scan_parameters(
         spent += sum(series.values.size - 1 for series in scanned)
         dips = _find_dips(scanned, problem.output_scale)
         dips = dips[: _STARTS_IN_DOUBT if is_doubtful else _STARTS]
-        refined, count = _refine_dips(problem, dips, best.rms, budget - spent, is_late)
-        spent += count
-        ends += refined
-        reached = min(best, *refined, key=lambda candidate: candidate.rms) if refined else best
+        refined = _refine_dips(problem, dips, best.rms, budget - spent, is_late, len(dips) + 1)
+        spent += refined.evaluations
+        ends += refined.ends
+        reached = min((best, *refined.ends), key=lambda candidate: candidate.rms)
         gains = reached.rms < best.rms * (1.0 - SAME_OPTIMUM)
         best = reached
         if not gains:
@@ -129,13 +130,28 @@ def scan_by_projection(
     budget: int,
     is_late: Callable[[], bool] | None = None,
 ) -> ScanResult:
-    """Scan the whole range with the linear parameters solved for (`projection`)."""
+    """Scan the whole range with the linear parameters solved for (`projection`).
+
+    A filter has a minimum at many lags. So least squares continues from more points, until two
+    have ended in the best.
+    """
     points, fitness, spent = draw_projected_points(problem, start.theta, seed, budget)
     order = np.argsort(fitness, kind="stable")
     dips = [(points[i], float(fitness[i])) for i in order if fitness[i] < problem.output_scale]
-    refined, count = _refine_dips(problem, dips[:_STARTS], start.rms, budget - spent, is_late)
-    best = min(start, *refined, key=lambda candidate: candidate.rms) if refined else start
-    return ScanResult(best, (start, *refined), spent + count, len(dips[:_STARTS]))
+    is_filter = bool(problem.model.corrections)
+    dips = dips[: _STARTS_IN_DOUBT if is_filter else _STARTS]
+    enough = _ENOUGH_ENDS if is_filter else len(dips) + 1
+    refined = _refine_dips(problem, dips, start.rms, budget - spent, is_late, enough)
+    best = min((start, *refined.ends), key=lambda candidate: candidate.rms)
+    return ScanResult(best, (start, *refined.ends), spent + refined.evaluations, refined.starts)
+
+
+class _RefinedDips(NamedTuple):
+    """Ends of least squares, the simulations spent, and the dips from which it continued."""
+
+    ends: tuple[RefinedCandidate, ...]
+    evaluations: int
+    starts: int
 
 
 def _refine_dips(
@@ -144,17 +160,21 @@ def _refine_dips(
     best: float,
     budget: int,
     is_late: Callable[[], bool] | None,
-) -> tuple[list[RefinedCandidate], int]:
-    """Refine dips, and further only those that come near the best RMS; count the simulations."""
+    enough: int,
+) -> _RefinedDips:
+    """Refine dips, and further only those that come near the best RMS.
+
+    It ends early when so many (`enough`) have reached the best.
+    """
     ends: list[RefinedCandidate] = []
-    spent = 0
+    spent, starts, lowest = 0, 0, best
     for point, rms in dips:
         if is_late is not None and is_late():
             break
         trial = refine_candidate(problem, point, rms, budget - spent, _TRIAL_STEPS)
         if trial is None:
             break
-        spent += trial.evaluations
+        spent, starts = spent + trial.evaluations, starts + 1
         if not trial.rms < _PROMISING * best:
             continue
         end = refine_candidate(problem, trial.theta, trial.rms, budget - spent, _MAX_STEPS)
@@ -162,7 +182,10 @@ def _refine_dips(
             break
         spent += end.evaluations
         ends.append(end)
-    return ends, spent
+        lowest = min(lowest, end.rms)
+        if sum(one.rms <= lowest * (1.0 + SAME_OPTIMUM) for one in ends) >= enough:
+            break
+    return _RefinedDips(tuple(ends), spent, starts)
 
 
 def continue_from_archive(

@@ -7,11 +7,16 @@ problem (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 
 others are drawn, by Latin hypercube sampling.
 
 Which parameters are linear is tested on the outputs, not read from the equations.
+
+A filter's likelihood is flat far from its minima, and no gain is linear in it. There the points
+are those of the free run, with the sizes of noise kept. They show whether the search missed a
+minimum, so they are drawn even if nothing is linear.
 """
 
 import numpy as np
 
 from sysid.core.types import RANK_TOLERANCE, FloatArray
+from sysid.simulation.free_run import convert_to_free_run
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit
 from sysid.uncertainty.linear_model import make_move_generator
@@ -54,13 +59,15 @@ def draw_projected_points(
 ) -> tuple[FloatArray, FloatArray, int]:
     """Draw points over the whole range, with the linear parameters solved for.
 
+    Beside a filter these are points of the free run, and their fitness is the filter's.
+
     Parameters
     ----------
     theta : FloatArray, shape (D,)
         Where the linear parameters are tested.
     budget : int
-        Simulations at most. If they suffice for few points only, or if no parameter is linear,
-        there are none.
+        Simulations at most. If they suffice for few points only, or if no parameter of a free run
+        is linear, there are none.
 
     Returns
     -------
@@ -68,23 +75,37 @@ def draw_projected_points(
     fitness : FloatArray, shape (P,)
     evaluations : int
     """
-    nothing = np.empty((0, theta.size)), np.empty(0)
+    free, start = convert_to_free_run(problem, theta)
+    drawn, spent = _draw_free_points(free, start, seed, budget, needs_linear=free is problem)
+    points = np.repeat(theta[None], len(drawn), axis=0)
+    points[:, [problem.free_names.index(name) for name in free.free_names]] = drawn
+    fitness = problem.evaluate_fitness(points) if len(points) else np.empty(0)
+    return points, fitness, spent + len(points)
+
+
+def _draw_free_points(
+    problem: Problem, theta: FloatArray, seed: int, budget: int, *, needs_linear: bool
+) -> tuple[FloatArray, int]:
+    """Draw the points (P, D) without their fitness; return the simulations so far too."""
+    nothing = np.empty((0, theta.size))
     if budget < 3 * theta.size + 1:
-        return *nothing, 0
+        return nothing, 0
     linear, spent = find_linear_parameters(problem, theta)
     count = min(_POINTS, int(_SHARE * (budget - spent)) // (len(linear) + 2))
-    if not linear or len(linear) == theta.size or count < _FEWEST_POINTS:
-        return *nothing, spent
+    if len(linear) == theta.size or count < _FEWEST_POINTS or (needs_linear and not linear):
+        return nothing, spent
     random = make_move_generator(seed)
     unit = np.array([random.permutation(count) for _ in theta]).T
     points = from_unit(problem.evaluator, (unit + random.random(unit.shape)) / count)
+    if not linear:
+        return points, spent
     points[:, linear] = theta[linear]
     at_once = max(1, _MAX_VALUES // ((len(linear) + 1) * problem.evaluator.weight.size))
     moves = _choose_moves(problem, theta)
     for first in range(0, count, at_once):
         part = points[first : first + at_once]
         _solve_linear_parameters(problem, part, linear, moves[linear])
-    return points, problem.evaluate_fitness(points), spent + count * (len(linear) + 2)
+    return points, spent + count * (len(linear) + 1)
 
 
 def _choose_moves(problem: Problem, theta: FloatArray) -> FloatArray:

@@ -3,7 +3,7 @@
 Either at least two searches from random points ended in the best minimum, or nothing but noise is
 left in the residuals, or they are negligible. A false minimum leaves a part of the response in
 them. Searches that start near the best individual show nothing: they return to a false minimum as
-well.
+well. Nor do the innovations of a filter: with a large load they are white in any minimum.
 """
 
 from typing import Literal
@@ -32,7 +32,7 @@ def assess_search(
     because: Literal["starts", "residuals"] | None = None
     if minima.agreeing >= _ENOUGH_STARTS:
         because = "starts"
-    elif is_explained(problem, rms, tests):
+    elif not problem.model.corrections and is_explained(problem, rms, tests):
         because = "residuals"
     return SearchEvidence(
         because is not None,

@@ -347,6 +347,44 @@ def _describe_guess(guessed: Mapping[str, str], basis: str, option: ChannelOptio
     return f"channels were assigned by {basis}. To choose, give {option(guessed)}"
 
 
+def check_commands(model: Model, commands: Sequence[str] | None) -> None:
+    """Check the names of inputs that a controller computes.
+
+    Raises
+    ------
+    InvalidSettings
+        If there is no such input.
+    """
+    inputs = [signal.name for signal in model.inputs]
+    for i, name in enumerate(commands or ()):
+        if name not in inputs:
+            detail = f"model {model.name!r} has no input {name!r}{suggest_name(name, inputs)}"
+            raise InvalidSettings(f"/commands/{i}", detail)
+
+
+def hold_commands(
+    model: Model, records: Sequence[Record], commands: Sequence[str] | None
+) -> tuple[Record, ...]:
+    """Hold those inputs that a controller computes, unless it is given how they are read.
+
+    Raises
+    ------
+    InvalidSettings
+        If there is no such input.
+    """
+    check_commands(model, commands)
+    return tuple(
+        record.replace_holds(
+            {
+                channel.name: "zero"
+                for channel in record.inputs
+                if channel.name in (commands or ()) and channel.hold == "auto"
+            }
+        )
+        for record in records
+    )
+
+
 def check_holds(model: Model, holds: Mapping[str, object]) -> None:
     """Check the holds of signals.
 

@@ -82,6 +82,7 @@ ParameterChanges = Mapping[str, Mapping[str, Any]]
 
 _PARAMETERS = ("load", "tau", "noise")
 _SMALLEST, _LARGEST = 1e-3, 1e3  # deviation of a load at its input over the sensor's, by spans
+_ANY_LOWER, _ANY_UPPER = 1e-100, 1e100  # of a size, before the data are known
 _LONGEST = 10.0  # of the record: correlation time of a load
 _SPAN = 4.0  # of an output in its deviations
 _LEAST_SHARE, _MOST_SHARE = 1e-2, 1e4  # of the sensor's deviation: diffusion over the record
@@ -211,6 +212,21 @@ def check_noise_changes(names: Iterable[str], requested: NoiseModel) -> None:
                 f"{name} is a parameter of noise inside the plant. Set loss: "
                 f"{{noise_model: {kind}}} to change it",
             )
+
+
+def list_noise_parameters(model: Model, noise: NoiseModel) -> tuple[Parameter, ...]:
+    """List the parameters that a filter would add, with bounds that hold for any data.
+
+    Raises
+    ------
+    InvalidSettings
+        If the model has no place for such noise, or no filter.
+    """
+    if noise not in FILTERED:
+        return ()
+    filtered = add_kalman_filter(model, noise, NoiseScales({}, 1.0, 1.0))
+    added = filter(lambda one: is_noise_parameter(one.name), filtered.parameters)
+    return tuple(replace(one, lower=_ANY_LOWER, upper=_ANY_UPPER) for one in added)
 
 
 def list_plant_noise(model: Model) -> tuple[PlantNoise, ...]:

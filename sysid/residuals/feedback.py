@@ -51,14 +51,14 @@ def describe_feedback(series: Iterable[ResidualSeries]) -> list[str]:
     ]
 
 
-def find_commands(series: Iterable[ResidualSeries]) -> set[str]:
+def find_commands(series: Iterable[ResidualSeries], *, is_clear: bool = False) -> set[str]:
     """Find inputs that a controller seems to compute from an output: they follow its residuals.
 
-    White residuals count too. They leave a free run unbiased, but the command is held.
+    White residuals count too. They leave a free run unbiased, but the command is held. `is_clear`:
+    only those that nothing else explains beside a stable plant.
     """
-    return {
-        name for (name, _), (share, _) in _compute_shares(series).items() if share > _LIKELY_SHARE
-    }
+    least = _CLEAR_SHARE if is_clear else _LIKELY_SHARE
+    return {name for (name, _), (share, _) in _compute_shares(series).items() if share > least}
 
 
 def _compute_shares(

@@ -154,6 +154,8 @@ class Result:
         Parameters whose bounds follow the data, unless given.
     input_hold : tuple of InputHold
         How each input is read between its samples, and the estimates if it were read otherwise.
+    commands : tuple of str
+        Inputs that a controller computes, as the request or the data say. They are read held.
     known_before : KnownBefore
         Recorded time before the start of each record, s.
     search : SearchEvidence
@@ -206,6 +208,7 @@ class Result:
     time_unit: str
     data_bounds: tuple[str, ...]
     input_hold: tuple[InputHold, ...]
+    commands: tuple[str, ...]
     known_before: KnownBefore
     search: SearchEvidence
     posterior: Posterior | None

@@ -16,6 +16,7 @@ from sysid.kernels.compilation.build import get_kernel_address
 from sysid.kernels.layout import KernelVariant
 from sysid.kernels.signals.past_reads import list_delaying_inputs
 from sysid.language.tree import Number
+from sysid.models.channel_assignment import hold_commands
 from sysid.models.kalman_filter import add_kalman_filter, check_noise_changes
 from sysid.models.model import Correction, Model, Output, build_initial_parameters
 from sysid.models.model_delays import check_delays
@@ -156,7 +157,7 @@ class Problem:
         InvalidSettings, InvalidBounds
             If a setting cannot be used.
         """
-        records = tuple(records)
+        records = hold_commands(model, records, settings.commands)
         if model.rule is not None:
             raise InvalidSettings(
                 "/model/terms",

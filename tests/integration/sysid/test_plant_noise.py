@@ -13,9 +13,14 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.export.export import export_model
 from sysid.identification.identify import identify
+from sysid.minima.minima import scan_by_projection
+from sysid.minima.search_evidence import is_explained
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
+from sysid.residuals.residual_tests import run_residual_tests
 from sysid.results.identification import Identification
+from sysid.search.refine import refine_candidates
+from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
 
 PERIOD, GAIN, CONSTANT, LAG, SENSOR = 0.25, 2.0, 12.3, 4.25, 0.02
@@ -81,6 +86,18 @@ def test_a_load_is_chosen_by_its_likelihood_and_white_noise_is_not() -> None:
     assert identify("fopdt", make_record(0.0, 20.0), QUICK).noise_model == "white"
 
 
+def test_a_drift_of_the_sensor_is_nearly_a_load() -> None:
+    found = identify("fopdt", make_record(0.0, 20.0, walk=0.01, seed=8), QUICK)
+    assert found.noise_model == "drift"
+    (told,) = [one for one in found.findings if one.explanation == "source of noise"]
+    assert told.brief == "the data do not tell a drift of y from a slow load at u"
+    assert "(loss: {noise_model: load})" in told.text
+    assert all(abs(move.stderrs) < 1.0 for move in told.moves) == (told.severity == "note")
+    for name, true in TRUTH.items():
+        low, high = found[name].interval95 or (np.nan, np.nan)
+        assert low <= true <= high, name
+
+
 def test_the_size_of_noise_is_bounded_as_any_parameter() -> None:
     loss, narrow = Loss(noise_model="load"), {"load[u]": (0.01, 1.0)}
     found = identify("fopdt", make_record(0.1, 20.0), QUICK, loss=loss, parameters=narrow)
@@ -95,6 +112,33 @@ def test_first_order_noise_of_a_sensor_is_no_load() -> None:
         noise[k] = keep * noise[k - 1] + 0.02 * random.normal()
     u, y = clean.inputs[0].values, clean.outputs[0].values - 20.0
     assert identify("fopdt", build_record(u, y + noise), QUICK).noise_model == "ar1"
+
+
+def test_white_innovations_show_no_minimum_to_be_the_best() -> None:
+    """A square wave fits nearly as well half a period later, upside down, beside a larger load."""
+    steps = np.resize([0.0, 1.0, -1.0, 1.0, -1.0, 1.0], 6)
+    random, n = np.random.default_rng(3), 600
+    u, keep, decay = np.repeat(steps, n // 6), np.exp(-PERIOD / CONSTANT), np.exp(-PERIOD / 20.0)
+    x, d, y = 0.0, 0.0, np.empty(n)
+    for k in range(n):
+        y[k] = x + SENSOR * random.normal()
+        x = keep * x + GAIN * (1 - keep) * (u[max(k - round(LAG / PERIOD), 0)] + d)
+        d = decay * d + 0.1 * np.sqrt(1 - decay**2) * random.normal()
+    record, loss = build_record(u, y), Loss(noise_model="load")
+    problem = Problem.build(load_model("fopdt"), [record], loss=loss, initial="rest")
+    values = {"K": -1.5, "T": 12.0, "L": 29.0, "y0": 20.0, "load[u]": 20.0, "tau[u]": 50.0}
+    (false,) = refine_candidates(problem, [np.array([values[one] for one in problem.free_names])])
+    assert false is not None
+    tests = run_residual_tests(problem, problem.predict(false.theta[None])[0], "estimation")
+    assert is_explained(problem, false.rms, tests)
+    lag = problem.free_names.index("L")
+    assert false.theta[lag] > 20.0
+    scanned = scan_by_projection(problem, false, 1, 6000)
+    assert scanned.best.theta[lag] == pytest.approx(LAG, abs=0.3)
+    assert scanned.starts < 12  # two ends are enough
+    found = identify("fopdt", record, loss=loss)
+    assert found["L"].value == pytest.approx(LAG, abs=0.3)
+    assert found.search.because == "starts"
 
 
 def test_validation_is_predicted_by_the_filter_that_was_chosen() -> None:

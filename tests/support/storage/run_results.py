@@ -58,6 +58,7 @@ def conclude(
             time_unit="s",
             data_bounds=(),
             input_hold=(),
+            commands=(),
             known_before=KnownBefore((), ()),
             search=SearchEvidence(True, "starts", 10, 5),
             posterior=None,
