@@ -13,7 +13,7 @@ from service.formats.read_options import ReadOptions
 from service.formats.tabular.bad_values import apply_status_columns, mask_markers
 from service.formats.tabular.cells import begins_like_number, classify_cell
 from service.formats.tabular.long_tables import (
-    Signal,
+    TableSignal,
     find_long_table,
     has_sparse_rows,
     list_signals,
@@ -114,7 +114,7 @@ def build_recording(table: Table, options: ReadOptions, notes: list[str]) -> Rec
 
 
 def _build_channels(
-    signals: Sequence[Signal],
+    signals: Sequence[TableSignal],
     table: Table,
     times: FloatArray,
     time_unit: str,

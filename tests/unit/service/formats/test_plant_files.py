@@ -430,7 +430,8 @@ SPANS = pd.to_timedelta(np.arange(INPUT.size) * 100, unit="ms")
 
 def make_iddata(**changes: object) -> object:
     """An `iddata` as its properties are stored: matrices, names in cells, period in its unit."""
-    from matio.utils import MatlabOpaque
+    with warnings.catch_warnings(action="ignore"):
+        from matio.utils import MatlabOpaque
 
     properties = {
         "OutputData_": OUTPUT[:, np.newaxis],
