@@ -19,6 +19,7 @@ from service.cli.common import (
     STANDARD_INPUT,
     AsJson,
     Columns,
+    Exclude,
     FieldOrigins,
     Force,
     McapClock,
@@ -149,6 +150,7 @@ def identify(
     sample_time: SampleTime = None,
     columns: Columns = None,
     missing: Missing = None,
+    exclude: Exclude = None,
     clock: McapClock = None,
     report: Annotated[
         Path | None,
@@ -185,6 +187,7 @@ def identify(
         segments=segments,
         columns=columns,
         missing=missing,
+        exclude=exclude,
         clock=clock,
     )
     recording = read_input_files(files, reading)
