@@ -132,6 +132,14 @@ Missing = Annotated[
         "default words such as Bad do, and numbers such as -9999 that stand apart.",
     ),
 ]
+Exclude = Annotated[
+    str | None,
+    typer.Option(
+        metavar="RANGE,…",
+        help="Times (s), values or words to leave out: t=100:200,flow=90:,state=Bad. What follows "
+        "rows that are cut out is an experiment of its own.",
+    ),
+]
 McapClock = Annotated[
     str | None,
     typer.Option(
@@ -569,7 +577,7 @@ def format_decimals(value: float | None) -> str | None:
 INVALID_STATUS = 422
 UPLOAD_OPTIONS = {
     f"?{name}": f"--{name.replace('_', '-')}"
-    for name in ("name", "segments", "sample_time", "columns", "missing", "clock")
+    for name in ("name", "segments", "sample_time", "columns", "missing", "exclude", "clock")
 }
 POINTER_PATTERN = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
 """Pointers in a message: to a field of that name elsewhere, or to a fault in an axis value."""

@@ -14,6 +14,7 @@ from service.cli.common import (
     STANDARD_INPUT,
     AsJson,
     Columns,
+    Exclude,
     FieldOrigins,
     Force,
     Limit,
@@ -139,6 +140,7 @@ def add_datasets(
     sample_time: SampleTime = None,
     columns: Columns = None,
     missing: Missing = None,
+    exclude: Exclude = None,
     clock: McapClock = None,
     as_json: bool = False,
 ) -> None:
@@ -159,6 +161,7 @@ def add_datasets(
                     sample_time=sample_time,
                     columns=columns,
                     missing=missing,
+                    exclude=exclude,
                     clock=clock,
                 )
             )
@@ -190,6 +193,7 @@ def check_dataset(
     sample_time: SampleTime = None,
     columns: Columns = None,
     missing: Missing = None,
+    exclude: Exclude = None,
     clock: McapClock = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -208,6 +212,7 @@ def check_dataset(
         segments=segments,
         columns=columns,
         missing=missing,
+        exclude=exclude,
         clock=clock,
     )
     recording = read_input_file(file, options)

@@ -1,6 +1,7 @@
 """`lagid identify`: one identification in this process, without a server."""
 
 import json
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,6 +20,7 @@ from service.cli.common import (
     STANDARD_INPUT,
     AsJson,
     Columns,
+    Exclude,
     FieldOrigins,
     Force,
     McapClock,
@@ -149,6 +151,7 @@ def identify(
     sample_time: SampleTime = None,
     columns: Columns = None,
     missing: Missing = None,
+    exclude: Exclude = None,
     clock: McapClock = None,
     report: Annotated[
         Path | None,
@@ -176,6 +179,7 @@ def identify(
     if report is not None:
         _check_report(report, force)
     protect_file(output, force)
+    _refuse_file_after_json(files)
     data = _name_files(files)
     unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(files[0], validation)
@@ -185,6 +189,7 @@ def identify(
         segments=segments,
         columns=columns,
         missing=missing,
+        exclude=exclude,
         clock=clock,
     )
     recording = read_input_files(files, reading)
@@ -341,6 +346,15 @@ def _refuse_same_file(data: Path, validation: Path | None) -> None:
         fail_usage(
             f"--validation {validation}: this is the estimation recording. Name another, or use "
             "--set validation.fraction=0.3"
+        )
+
+
+def _refuse_file_after_json(files: Sequence[Path]) -> None:
+    """End the command if the word after ``--json`` is meant as a file to write, not to read."""
+    words = sys.argv[sys.argv.index("--json") + 1 :] if "--json" in sys.argv else []
+    if len(files) > 1 and words and Path(words[0]).suffix == ".json" and Path(words[0]) in files:
+        fail_usage(
+            f"--json takes no file, it prints on standard output. To write one: --output {words[0]}"
         )
 
 

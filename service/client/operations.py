@@ -81,6 +81,7 @@ class Operations(Exchange):
         sample_time: float | None = None,
         columns: str | None = None,
         missing: str | None = None,
+        exclude: str | None = None,
         clock: str | None = None,
     ) -> RestCall[documents.DatasetDocument]:
         """Store a recording from a file of any kind that is read, or from its bytes."""
@@ -91,6 +92,7 @@ class Operations(Exchange):
             "sample_time": sample_time,
             "columns": columns,
             "missing": missing,
+            "exclude": exclude,
             "clock": clock,
         }
         return build_upload(source, name, options)

@@ -32,6 +32,8 @@ class ReadOptions:
     missing : tuple of str
         Words and numbers that mark bad data. If there are any, no other number does; ``none``
         alone says that no number does.
+    exclude : tuple of str
+        Ranges that are left out: ``t=100:200`` (s), ``flow=90:``, ``state=Bad``.
     clock : {"log", "publish", "stamp"}
         Times of an MCAP file: when a message was logged or sent, or the stamp in its header.
     limits : UploadLimits
@@ -46,6 +48,7 @@ class ReadOptions:
     segments: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
     clock: Clock = "log"
     limits: UploadLimits = DEFAULT_LIMITS
 
@@ -92,6 +95,7 @@ def build_options(
     segments: Sequence[str] | str | None = None,
     columns: Sequence[str] | str | None = None,
     missing: Sequence[str | float] | str | None = None,
+    exclude: Sequence[str] | str | None = None,
     clock: str | None = None,
     limits: UploadLimits = DEFAULT_LIMITS,
 ) -> ReadOptions:
@@ -107,6 +111,7 @@ def build_options(
         segments=tuple(name for name in _split(segments) if name),
         columns=_split(columns),
         missing=tuple(word for word in _split(missing) if word),
+        exclude=tuple(condition for condition in _split(exclude) if condition),
         clock=cast(Clock, clock or "log"),
         limits=limits,
     )

@@ -35,6 +35,7 @@ def read_recording(
     segments: Sequence[str] | str = (),
     columns: Sequence[str] | str = (),
     missing: Sequence[str | float] | str = (),
+    exclude: Sequence[str] | str = (),
     clock: Clock = "log",
 ) -> Recording:
     r"""Read a recording: text of columns, Excel, Parquet, NumPy, MATLAB or MCAP.
@@ -59,6 +60,9 @@ def read_recording(
     missing : sequence of str or float
         Words and numbers that mark bad data, ``"-9999,Offline"``. If there are any, no other
         number is taken for one; ``"none"`` says that no number is.
+    exclude : sequence of str
+        Ranges of times (s) or values, and words of a column: ``"t=100:200,flow=90:,state=Bad"``.
+        Rows of times or words are cut out, values are missing.
     clock : {"log", "publish", "stamp"}
         Times of an MCAP file: when a message was logged or sent, or the stamp in its header.
 
@@ -79,7 +83,12 @@ def read_recording(
     (('valve', 'flow'), 'l/min', 0.2)
     """
     options = build_options(
-        sample_time=sample_time, segments=segments, columns=columns, missing=missing, clock=clock
+        sample_time=sample_time,
+        segments=segments,
+        columns=columns,
+        missing=missing,
+        exclude=exclude,
+        clock=clock,
     )
     recording, notes = read_with_notes(source, options)
     tell_notes((*notes, *(one.sentences for one in check_recording(recording))))

@@ -21,7 +21,7 @@ from sysid.data.records import Recording
 from sysid.data.value_checks import find_infinite_value
 from sysid.inspection.inspect import inspect_recording
 
-_OF_TABLES: Final = ("sample_time", "segments", "columns", "missing")
+_OF_TABLES: Final = ("sample_time", "segments", "columns", "missing", "exclude")
 
 
 def main() -> int:

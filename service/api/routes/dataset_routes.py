@@ -99,6 +99,13 @@ Missing = Annotated[
     ),
 ]
 
+Exclude = Annotated[
+    str | None,
+    Query(
+        description="ranges of times (s) or values, and words of a column, separated by commas: "
+        "`t=100:200,flow=90:,state=Bad`. Rows of times or words are cut out, values are missing"
+    ),
+]
 McapClock = Annotated[
     Clock | None,
     Query(
@@ -118,6 +125,7 @@ async def add_dataset(
     sample_time: SampleTime = None,
     columns: Columns = None,
     missing: Missing = None,
+    exclude: Exclude = None,
     clock: McapClock = None,
 ) -> DatasetOut:
     """Store a recording: CSV or other text, Excel, Parquet, NumPy, MATLAB or MCAP.
@@ -142,6 +150,7 @@ async def add_dataset(
                 segments=segments,
                 columns=columns,
                 missing=missing,
+                exclude=exclude,
                 clock=clock,
                 limits=UploadLimits(
                     file_bytes=settings.max_upload_bytes, memory_bytes=parts.readers.memory_bytes

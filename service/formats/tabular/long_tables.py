@@ -31,7 +31,7 @@ _RESERVED: Final = ("id", "evid", "mdv", "cmt", "addl", "ii", "ss", "rate")
 _STATES: Final = {"on": "1", "off": "0"}
 
 
-class LongChannel(NamedTuple):
+class TableSignal(NamedTuple):
     """A signal of a table: where its rows are among those of the table, and its values."""
 
     name: str
@@ -153,7 +153,7 @@ def sort_rows(long: LongTable, clock: TimeAxis, starts: IntArray) -> tuple[LongT
     return replace(long, table=replace(table, values=values, rows=table.rows[order])), moved
 
 
-def list_signals(long: LongTable, notes: list[str]) -> list[LongChannel]:
+def list_signals(long: LongTable, notes: list[str]) -> list[TableSignal]:
     """List the signals of a long table, in the order in which their names appear.
 
     Raises
@@ -175,7 +175,7 @@ def list_signals(long: LongTable, notes: list[str]) -> list[LongChannel]:
         known = np.isfinite(values)
         if known.any():
             unit = _read_unit(long, rows) or column.unit
-            signals.append(LongChannel(name, unit, "number", rows[known], values[known]))
+            signals.append(TableSignal(name, unit, "number", rows[known], values[known]))
     key = long.table.columns[long.key].name
     if not signals:
         raise UnreadableFile(f"no name of column {key!r} has numbers in column {column.name!r}")
@@ -218,7 +218,7 @@ def _read_unit(long: LongTable, rows: IntArray) -> str:
 
 def list_wide_signals(
     table: Table, times: FloatArray, starts: IntArray, notes: list[str], *, is_sparse: bool
-) -> list[LongChannel]:
+) -> list[TableSignal]:
     """List the signals that have a column of their own.
 
     Where times repeat in the rows of others, a signal has the rows with a value of its own. One of
@@ -236,7 +236,7 @@ def list_wide_signals(
             if not _increases(times[rows], segments[rows]):
                 crowded.append(column.name)
                 continue
-        signals.append(LongChannel(column.name, column.unit, column.kind, rows, numbers[rows]))
+        signals.append(TableSignal(column.name, column.unit, column.kind, rows, numbers[rows]))
     if crowded:
         notes.append(f"columns with several values at a time were left out: {', '.join(crowded)}")
     return signals

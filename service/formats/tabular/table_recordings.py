@@ -12,8 +12,9 @@ from service.formats.advice import GIVE_PERIOD
 from service.formats.read_options import ReadOptions
 from service.formats.tabular.bad_values import apply_status_columns, mask_markers
 from service.formats.tabular.cells import begins_like_number, classify_cell
+from service.formats.tabular.exclusions import KeptRows, exclude_ranges
 from service.formats.tabular.long_tables import (
-    LongChannel,
+    TableSignal,
     find_long_table,
     has_sparse_rows,
     list_signals,
@@ -106,6 +107,10 @@ def build_recording(table: Table, options: ReadOptions, notes: list[str]) -> Rec
     _check_left_out(table, notes)
     if not has_own_rows or (long is None and np.any(_find_falls(clock.seconds, starts))):
         _check_order(clock.seconds, starts, table, notes)
+    if options.exclude:
+        kept = exclude_ranges(KeptRows(table, clock.seconds, starts), options.exclude, notes)
+        table, starts, clock = kept.table, kept.starts, clock._replace(seconds=kept.times)
+        long = None if long is None else replace(long, table=table)
     signals = [] if long is None else list_signals(long, notes)
     signals += list_wide_signals(table, clock.seconds, starts, notes, is_sparse=has_own_rows)
     times, spans = _build_segments(table, labels, clock.seconds, starts, notes)
@@ -114,7 +119,7 @@ def build_recording(table: Table, options: ReadOptions, notes: list[str]) -> Rec
 
 
 def _build_channels(
-    signals: Sequence[LongChannel],
+    signals: Sequence[TableSignal],
     table: Table,
     times: FloatArray,
     time_unit: str,

@@ -430,7 +430,8 @@ SPANS = pd.to_timedelta(np.arange(INPUT.size) * 100, unit="ms")
 
 def make_iddata(**changes: object) -> object:
     """An `iddata` as its properties are stored: matrices, names in cells, period in its unit."""
-    from matio.utils import MatlabOpaque
+    with warnings.catch_warnings(action="ignore"):
+        from matio.utils import MatlabOpaque
 
     properties = {
         "OutputData_": OUTPUT[:, np.newaxis],
@@ -541,3 +542,38 @@ def test_a_channel_knows_the_unit_of_its_times(heading: str, unit: str) -> None:
     assert read(join_rows("t,u,y"))[0].channel("u").time_unit == "s"
     with pytest.warns(ReadingNote, match=f"converted from {unit} to s"):
         assert Recording({heading: TIMES, "u": INPUT}).channel("u").time_unit == unit
+
+
+def test_excluded_times_cut_a_record_and_excluded_values_are_missing() -> None:
+    recording, notes = read(join_rows("t,u,y"), exclude="t=5:9.95, y=-0.3:")
+    assert len(recording.segments) == 2
+    first, second = recording.split_segments()
+    assert (first.channel("u").values.size, second.channel("u").values.size) == (50, 140)
+    np.testing.assert_array_equal(second.channel("u").values, INPUT[100:])
+    kept = np.where(OUTPUT >= -0.3, np.nan, OUTPUT)
+    np.testing.assert_array_equal(second.channel("y").values, kept[100:])
+    assert "t=5:9.95 excludes 50 rows; what follows is a measurement of its own" in notes
+    assert f"y=-0.3: excludes {np.count_nonzero(OUTPUT >= -0.3)} values of 'y'" in notes
+
+
+def test_rows_are_excluded_by_a_word_and_from_long_tables() -> None:
+    text = write_marked("7.5", "t,u,y,mode", ",auto", ",Service")
+    recording, _ = read(text, exclude="mode=service")
+    assert len(recording.segments) == 3
+    assert 7.5 not in recording.channel("y").values
+    long, _ = read(LONG["seconds"], exclude="t=:1.95")
+    assert long.channel("valve").values.size == INPUT.size - 20
+
+
+@pytest.mark.parametrize(
+    ("condition", "words"),
+    [
+        ("z=1:2", "exclude z=1:2: there is no column 'z'"),
+        ("t=a:2", "exclude t=a:2: found 'a:2'; need a range such as 100:200"),
+        ("y=2:1", "exclude y=2:1: found '2:1'; need a range"),
+        ("t=:", "exclude: t=: excludes every row"),
+        ("t", "exclude t: found ''; need a range"),
+    ],
+)
+def test_an_exclusion_that_cannot_be_is_refused(condition: str, words: str) -> None:
+    assert words in str(refuse(join_rows("t,u,y"), exclude=condition))
