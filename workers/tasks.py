@@ -286,4 +286,7 @@ def build_pack_problems(
 def prepare_run_records(spec: ProblemSpec, records: Mapping[str, Records]) -> FitRecords:
     """Prepare the records of a run: split off validation data, add noise to the others."""
     validation = None if spec.validation is None else records[spec.validation]
-    return prepare_records(records[spec.records], validation, spec.validation_fraction, spec.noise)
+    model = _parse_cached_model(json.dumps(spec.model))
+    return prepare_records(
+        model, records[spec.records], validation, spec.validation_fraction, spec.noise
+    )

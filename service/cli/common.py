@@ -116,6 +116,39 @@ Segments = Annotated[
 SampleTime = Annotated[
     float | None, typer.Option(help="Sampling period in s, for a file without a time column.")
 ]
+Columns = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME,…",
+        help="Names of the columns of a file without a header: t,u,,y. A column with an empty "
+        "name is left out.",
+    ),
+]
+Missing = Annotated[
+    str | None,
+    typer.Option(
+        metavar="MARKER,…",
+        help="Words and numbers that mark bad data: -9999,Offline. none: no number does. By "
+        "default words such as Bad do, and numbers such as -9999 that stand apart.",
+    ),
+]
+Exclude = Annotated[
+    str | None,
+    typer.Option(
+        metavar="RANGE,…",
+        help="Times (s), values or words to leave out: t=100:200,flow=90:,state=Bad. What follows "
+        "rows that are cut out is an experiment of its own.",
+    ),
+]
+McapClock = Annotated[
+    str | None,
+    typer.Option(
+        "--clock",
+        metavar="[log|publish|stamp]",
+        help="Times of an MCAP file: when a message was logged (default) or sent, or the stamp in "
+        "its header.",
+    ),
+]
 DATA_HELP = "Recording: text (CSV), Excel, Parquet, NumPy, MATLAB or MCAP; - for standard input."
 AsJson = Annotated[
     bool,
@@ -542,7 +575,10 @@ def format_decimals(value: float | None) -> str | None:
 
 
 INVALID_STATUS = 422
-UPLOAD_OPTIONS = {"?name": "--name", "?segments": "--segments", "?sample_time": "--sample-time"}
+UPLOAD_OPTIONS = {
+    f"?{name}": f"--{name.replace('_', '-')}"
+    for name in ("name", "segments", "sample_time", "columns", "missing", "exclude", "clock")
+}
 POINTER_PATTERN = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
 """Pointers in a message: to a field of that name elsewhere, or to a fault in an axis value."""
 

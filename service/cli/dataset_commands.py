@@ -13,9 +13,13 @@ from service.cli.common import (
     LISTED_ENTRIES,
     STANDARD_INPUT,
     AsJson,
+    Columns,
+    Exclude,
     FieldOrigins,
     Force,
     Limit,
+    McapClock,
+    Missing,
     Quiet,
     SampleTime,
     Segments,
@@ -40,7 +44,6 @@ from service.cli.common import (
     report_faults,
     server_command,
     show_examples,
-    split_names,
     upload_origins,
 )
 from service.cli.item_commands import (
@@ -60,7 +63,9 @@ if TYPE_CHECKING:
     from service.client.client import Client
 
 
-app = typer.Typer(help="Add, show, download, simulate and derive recordings.", no_args_is_help=True)
+app = typer.Typer(
+    help="Add, show, download, simulate, derive and join recordings.", no_args_is_help=True
+)
 
 DATASET_ID = "ds_"
 
@@ -133,6 +138,10 @@ def add_datasets(
     ] = None,
     segments: Segments = None,
     sample_time: SampleTime = None,
+    columns: Columns = None,
+    missing: Missing = None,
+    exclude: Exclude = None,
+    clock: McapClock = None,
     as_json: bool = False,
 ) -> None:
     """Store recordings."""
@@ -145,7 +154,16 @@ def add_datasets(
         source = read_file(file) if file == STANDARD_INPUT else file
         with report_faults(upload_origins(file)):
             stored.append(
-                client.add_dataset(source, name, segments=segments, sample_time=sample_time)
+                client.add_dataset(
+                    source,
+                    name,
+                    segments=segments,
+                    sample_time=sample_time,
+                    columns=columns,
+                    missing=missing,
+                    exclude=exclude,
+                    clock=clock,
+                )
             )
         if not as_json:
             _print_dataset(stored[-1])
@@ -173,6 +191,10 @@ def check_dataset(
     file: Annotated[Path, typer.Argument(metavar="FILE", help=DATA_HELP)],
     segments: Segments = None,
     sample_time: SampleTime = None,
+    columns: Columns = None,
+    missing: Missing = None,
+    exclude: Exclude = None,
+    clock: McapClock = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -180,11 +202,20 @@ def check_dataset(
 
     Gaps, stamps, repeated and coarse values, limits, means, resampled logs, changes of a unit.
     """
-    from service.cli.identify_command import FileOptions, read_input_file
+    from service.cli.identify_command import build_file_options, read_input_file
     from sysid.core.value_documents import encode
     from sysid.inspection.inspect import check_recording
 
-    recording = read_input_file(file, FileOptions(sample_time, tuple(split_names(segments))))
+    options = build_file_options(
+        file,
+        sample_time=sample_time,
+        segments=segments,
+        columns=columns,
+        missing=missing,
+        exclude=exclude,
+        clock=clock,
+    )
+    recording = read_input_file(file, options)
     findings = check_recording(recording)
     if as_json:
         print_json([encode(finding) for finding in findings])
@@ -282,6 +313,22 @@ def simulate_dataset(
         body["parameters"] = {**(body.get("parameters") or {}), **values}
     with report_faults(_field_origins(file, sets)):
         return client.simulate_dataset(body)
+
+
+@app.command("join", epilog=show_examples("lagid dataset join supply room --name heating"))
+@server_command(_print_dataset)
+def join_datasets(
+    client: "Client",
+    datasets: Annotated[
+        list[str], typer.Argument(metavar="DATASET…", help="Ids or names of the recordings.")
+    ],
+    name: Annotated[str | None, typer.Option(help="Name of the new dataset.")] = None,
+) -> Mapping[str, Any]:
+    """Join recordings of several loggers on one clock; nothing is resampled."""
+    if len(datasets) < 2:
+        fail_usage(f"need two or more recordings to join; found {datasets[0]}")
+    with report_faults(FieldOrigins({"/datasets": "DATASET", "/name": "--name"})):
+        return client.join(datasets, name)
 
 
 @app.command(

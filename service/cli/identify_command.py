@@ -1,9 +1,10 @@
 """`lagid identify`: one identification in this process, without a server."""
 
 import json
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import isfinite
 from pathlib import Path
 from shlex import quote
@@ -18,8 +19,12 @@ from service.cli.common import (
     OUTPUT_PANEL,
     STANDARD_INPUT,
     AsJson,
+    Columns,
+    Exclude,
     FieldOrigins,
     Force,
+    McapClock,
+    Missing,
     ModelName,
     Quiet,
     SampleTime,
@@ -39,7 +44,6 @@ from service.cli.common import (
     print_table,
     protect_file,
     read_file,
-    split_names,
     split_setting_path,
     upload_origins,
     write_file,
@@ -58,6 +62,7 @@ from sysid.core.settings import NOISE_MODELS
 from sysid.core.text import plain_unit
 
 if TYPE_CHECKING:
+    from service.formats.read_options import ReadOptions
     from service.jobs.job_schemas import JobIn
     from sysid.data.records import Record, Recording
     from sysid.identification.identify_arguments import ReadRecords
@@ -97,18 +102,13 @@ ResultFile = Annotated[
 ]
 
 
-@dataclass(frozen=True, slots=True)
-class FileOptions:
-    """Options for reading files."""
-
-    sample_time: float | None
-    segments: tuple[str, ...]
-
-
 def identify(
-    data: Annotated[
-        Path,
-        typer.Argument(metavar="DATA", help=DATA_HELP),
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="DATA…",
+            help=f"{DATA_HELP} Files of several loggers are joined on one clock.",
+        ),
     ],
     model: ModelName,
     changes: Annotated[
@@ -149,6 +149,10 @@ def identify(
     ] = False,
     segments: Segments = None,
     sample_time: SampleTime = None,
+    columns: Columns = None,
+    missing: Missing = None,
+    exclude: Exclude = None,
+    clock: McapClock = None,
     report: Annotated[
         Path | None,
         typer.Option(
@@ -175,13 +179,23 @@ def identify(
     if report is not None:
         _check_report(report, force)
     protect_file(output, force)
+    _refuse_file_after_json(files)
+    data = _name_files(files)
     unchecked = _build_body(data, model, changes, parse_channels(channels))
-    _refuse_same_file(data, validation)
-    reading = FileOptions(sample_time, tuple(split_names(segments)))
-    recording = read_input_file(data, reading)
+    _refuse_same_file(files[0], validation)
+    reading = build_file_options(
+        files[0],
+        sample_time=sample_time,
+        segments=segments,
+        columns=columns,
+        missing=missing,
+        exclude=exclude,
+        clock=clock,
+    )
+    recording = read_input_files(files, reading)
     body, loaded = check_body(unchecked, _count_most_experiments(recording))
     with _report_core_faults():
-        read = _extract_records(recording, Path(name_file(data)), loaded, body)
+        read = _extract_records(recording, data, loaded, body)
         validation_records: Sequence[Record] = ()
         if validation is not None:
             validation_records = _extract_records(
@@ -189,7 +203,7 @@ def identify(
             ).records
     from sysid.core.jit import announce_compilation, read_clock
 
-    printed = [*read.notes, *_print_events(read.records)]
+    printed = [*read.notes, *_print_events((*read.records, *validation_records))]
     begun = read_clock()
     with _report_core_faults(), announce_compilation(err.print):
         result = _run_identification(
@@ -201,7 +215,7 @@ def identify(
     result = add_reading_notes(result, read.notes)
     print_result(result, seconds, output, as_json=as_json, printed=printed)
     if report is not None:
-        _write_report(report, Path(name_file(data)), loaded, result, seconds, body)
+        _write_report(report, data, loaded, result, seconds, body)
 
 
 def _check_report(path: Path, force: bool) -> None:
@@ -335,22 +349,56 @@ def _refuse_same_file(data: Path, validation: Path | None) -> None:
         )
 
 
-def read_input_file(path: Path, reading: FileOptions) -> "Recording":
+def _refuse_file_after_json(files: Sequence[Path]) -> None:
+    """End the command if the word after ``--json`` is meant as a file to write, not to read."""
+    words = sys.argv[sys.argv.index("--json") + 1 :] if "--json" in sys.argv else []
+    if len(files) > 1 and words and Path(words[0]).suffix == ".json" and Path(words[0]) in files:
+        fail_usage(
+            f"--json takes no file, it prints on standard output. To write one: --output {words[0]}"
+        )
+
+
+def build_file_options(path: Path, **given: Any) -> "ReadOptions":
+    """Build the options of reading a file; end the command if one cannot be."""
+    from service.formats.read_options import build_options
+
+    with _report_unreadable(path):
+        return build_options(**given)
+    raise AssertionError  # the command has ended
+
+
+def _name_files(files: Sequence[Path]) -> Path:
+    """Name the files of a recording in one: ``supply + room``."""
+    if len(files) == 1:
+        return Path(name_file(files[0]))
+    return Path(" + ".join(Path(name_file(file)).stem for file in files))
+
+
+@contextmanager
+def _report_unreadable(path: Path) -> Iterator[None]:
+    """End the command if a file or an option of reading it cannot be used."""
+    try:
+        yield
+    except UnreadableFile as error:
+        place = Path(error.name) if error.name else path
+        fail(upload_origins(place).describe_faults(to_field_errors(error)))
+
+
+def read_input_file(path: Path, options: "ReadOptions") -> "Recording":
     """Read a recording from a file and print notes about it on stderr."""
-    from service.formats.limits import DEFAULT_LIMITS
+    return read_input_files([path], options)
+
+
+def read_input_files(paths: Sequence[Path], options: "ReadOptions") -> "Recording":
+    """Read files, join them on one clock, and print notes on stderr."""
     from service.formats.recordings import read_with_notes
     from sysid.models.unit_checks import list_unknown_unit_warnings
 
-    check_file(path)
-    try:
-        recording, notes = read_with_notes(
-            read_file(path) if path == STANDARD_INPUT else path,
-            sample_time=reading.sample_time,
-            segments=reading.segments,
-            limits=DEFAULT_LIMITS,
-        )
-    except UnreadableFile as error:
-        fail(upload_origins(path).describe_faults(to_field_errors(error)))
+    for path in paths:
+        check_file(path)
+    with _report_unreadable(_name_files(paths)):
+        sources = [read_file(path) if path == STANDARD_INPUT else path for path in paths]
+        recording, notes = read_with_notes(sources, options)
     for note in (*notes, *list_unknown_unit_warnings(recording.channels)):
         err.print(f"note: {note}", markup=False)
     return recording

@@ -59,6 +59,7 @@ FIELD_ORIGINS = FieldOrigins(
         "/model": "--model …",
         "/sigma": "--sigma",
         "/relative": "--relative",
+        "/place": "--place",
         "/replicates": "--replicates",
         "/methods": "--methods",
         "/seed": "--seed",
@@ -96,6 +97,9 @@ Input = Annotated[
 Relative = Annotated[
     bool, typer.Option("--relative", help="σ is in standard deviations of the output.")
 ]
+Place = Annotated[
+    str, typer.Option(help="Where noise enters: sensor, or plant, as φ of the paper's recursion.")
+]
 Replicates = Annotated[
     int, typer.Option(help="Runs per σ and method, each with its own noise and search seed.")
 ]
@@ -129,6 +133,7 @@ def sweep_noise(
     samples: Annotated[int | None, typer.Option(help="Number of samples to simulate.")] = None,
     sample_time: Annotated[float | None, typer.Option(help="Sampling period in s.")] = None,
     relative: Relative = False,
+    place: Place = "sensor",
     replicates: Replicates = 20,
     methods: ClientMethods = "simple,improved",
     seed: Seed = 1,
@@ -149,6 +154,7 @@ def sweep_noise(
         "model": read_model(model),
         "sigma": [sigma_value for text in sigma for sigma_value in parse_sigma_grid(text)],
         "relative": relative,
+        "place": place,
         "replicates": replicates,
         "methods": split_names(methods),
         "seed": seed,

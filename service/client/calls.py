@@ -230,15 +230,15 @@ def build_event_stream(job: str, after: str | None) -> RestCall[bytes]:
 
 
 def build_upload(
-    source: str | Path | bytes, name: str | None, segments: str | None, sample_time: float | None
+    source: str | Path | bytes, name: str | None, options: Mapping[str, str | float | None]
 ) -> RestCall[Any]:
-    """Build the call that stores a file or bytes."""
+    """Build the call that stores a file or bytes; `options` say how it is read."""
     content = source if isinstance(source, bytes) else Path(source)
     kind = FILE_TYPE
     if isinstance(content, Path):
         kind = MCAP_TYPE if content.suffix.lower() == ".mcap" else FILE_TYPE
         name = name or content.name.removesuffix(".gz").rpartition(".")[0] or content.name
-    upload = call("POST /v1/datasets", name=name, segments=segments, sample_time=sample_time)
+    upload = call("POST /v1/datasets", name=name, **options)
     return replace(upload, content=content, headers={"content-type": kind})
 
 

@@ -939,7 +939,7 @@ class JobInDocument(TypedDict):
     """datasets by name or id, fitted together as several experiments"""
     validation: NotRequired[ValidationInDocument | None]
     """data that are compared, but not fitted"""
-    noise: NotRequired[NoiseInDocument]
+    noise: NotRequired[PlacedNoiseInDocument]
     """noise that is added before fitting"""
     seed: NotRequired[int]
     """seed of the search; the same seed gives the same result, bit for bit"""
@@ -1236,14 +1236,6 @@ class MoveDocument(TypedDict):
     stderrs: float | None
     """how far that is from the estimate, in standard errors of the estimate"""
 
-class NoiseInDocument(TypedDict):
-    """Noise added to the measured outputs before fitting, for sensitivity studies."""
-
-    sigma: NotRequired[float]
-    """standard deviation of the noise, in the unit of each output"""
-    seed: NotRequired[int]
-    """seed of the noise; the same seed gives the same noise"""
-
 class NoiseSourceDocument(TypedDict):
     """A source of noise, and its size."""
 
@@ -1373,6 +1365,18 @@ class ParameterSummaryDocument(TypedDict):
     """quantiles of estimate minus reference"""
     cramer_rao_bound: NotRequired[float | None]
     """least standard deviation under the added noise"""
+
+class PlacedNoiseInDocument(TypedDict):
+    """Noise added before fitting: to the measured outputs, or inside the plant."""
+
+    sigma: NotRequired[float]
+    """standard deviation of the noise, in the unit of each output"""
+    seed: NotRequired[int]
+    """seed of the noise; the same seed gives the same noise"""
+    place: NotRequired[Literal["sensor", "plant"]]
+    """`plant`: φ of Eq. 13 and 16, where the model's document says that noise enters. The record is simulated again with it. Then `sigma` is that of each sample of a recursion, or else per √s, in the unit of the state"""
+    parameters: NotRequired[dict[str, float]]
+    """true values of the simulation with noise inside the plant, by name"""
 
 class PlantNoiseDocument(TypedDict):
     """Noise inside the plant, and errors from one sample ahead to the free run."""
@@ -1739,6 +1743,8 @@ class RunDocument(TypedDict):
     """tests of the residuals"""
     onset_delays: NotRequired[list[OnsetDelayDocument] | None]
     """delay between the start of an input's and an output's change"""
+    time_unit: NotRequired[str | None]
+    """unit in which the record had its times, such as `min`. Estimates are in their own unit"""
     data_bounds: NotRequired[list[str] | None]
     """parameters whose bounds follow the data, unless given"""
     input_hold: NotRequired[list[InputHoldDocument] | None]

@@ -79,16 +79,35 @@ class Operations(Exchange):
         *,
         segments: str | None = None,
         sample_time: float | None = None,
+        columns: str | None = None,
+        missing: str | None = None,
+        exclude: str | None = None,
+        clock: str | None = None,
     ) -> RestCall[documents.DatasetDocument]:
         """Store a recording from a file of any kind that is read, or from its bytes."""
         if not (isinstance(source, bytes) or Path(source).exists()):
             raise FileNotFoundError(f"there is no file {source}")
-        return build_upload(source, name, segments, sample_time)
+        options = {
+            "segments": segments,
+            "sample_time": sample_time,
+            "columns": columns,
+            "missing": missing,
+            "exclude": exclude,
+            "clock": clock,
+        }
+        return build_upload(source, name, options)
 
     @fetch
     def simulate_dataset(self, body: Mapping[str, Any]) -> RestCall[documents.DatasetDocument]:
         """Make a dataset from a model, its true parameters, inputs and noise."""
         return call("POST /v1/datasets:simulate", json=body)
+
+    @fetch
+    def join(
+        self, datasets: list[str], name: str | None = None
+    ) -> RestCall[documents.DatasetDocument]:
+        """Make a dataset of several recordings on one clock; nothing is resampled."""
+        return call("POST /v1/datasets:join", json={"name": name, "datasets": datasets})
 
     @fetch
     def derive(

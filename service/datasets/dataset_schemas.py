@@ -10,7 +10,7 @@ from service.core.bodies.derived_bodies import take_setting
 from service.core.bodies.value_schemas import describe_value
 from service.core.bodies.wire import Answer, Body, DescribedBy, Labels, Page, Seed
 from sysid.core.findings import Finding
-from sysid.data.noise import Noise
+from sysid.data.noise import Noise, NoisePlace
 from sysid.data.records import Hold
 
 MAX_SIMULATED_SAMPLES = 10_000_000
@@ -87,6 +87,19 @@ class NoiseIn(Body):
     seed: Seed = take_setting(Noise, "seed")
 
 
+class PlacedNoiseIn(NoiseIn):
+    """Noise added before fitting: to the measured outputs, or inside the plant.
+
+    For noise inside the plant the records are simulated again, from their inputs and true
+    `parameters`. It enters where the model's document says (`noise: {plant: …}`).
+    """
+
+    place: NoisePlace = take_setting(Noise, "place")
+    parameters: dict[str, float] = Field(
+        default={}, description="true values of the simulation with noise inside the plant, by name"
+    )
+
+
 class SimulateIn(Body):
     """A dataset simulated from a model or a plant: parameters, inputs, and noise on its outputs.
 
@@ -137,6 +150,15 @@ class DeriveIn(Body):
         min_length=1,
         max_length=32,
         description="steps in order; each is an object with one key, the name of the step",
+    )
+
+
+class JoinIn(Body):
+    """Recordings of several loggers on one clock; each channel keeps its own times."""
+
+    name: str | None = Field(default=None, max_length=200, description="name of the new dataset")
+    datasets: list[str] = Field(
+        min_length=2, max_length=100, description="ids or names of the recordings"
     )
 
 

@@ -6,6 +6,7 @@ Requests name a dataset by its identifier, or by a name that is unique.
 import hashlib
 import json
 import tempfile
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +23,7 @@ from service.datasets.dataset_schemas import (
     DatasetOut,
     DatasetPage,
     DeriveIn,
+    JoinIn,
     LineageEdgeOut,
     LineageOut,
     SeriesOut,
@@ -31,8 +33,8 @@ from service.datasets.dataset_schemas import (
 from service.datasets.large_derivation import derive
 from service.datasets.stored_recordings import load_recording
 from service.formats.file_kinds import SUFFIXES, detect_kind
-from service.formats.limits import DEFAULT_LIMITS, UploadLimits
 from service.formats.mcap.mcap_files import write_recording
+from service.formats.read_options import DEFAULT_OPTIONS, ReadOptions
 from service.formats.sandbox import read_untrusted
 from service.repositories.dataset_rows import DatasetRepository, NewDataset, StoredDataset
 from service.repositories.lineage_rows import (
@@ -120,9 +122,7 @@ def add_upload(
     sha256: str,
     suffix: str = "",
     name: str | None = None,
-    segments: Sequence[str] = (),
-    sample_time: float | None = None,
-    limits: UploadLimits = DEFAULT_LIMITS,
+    options: ReadOptions = DEFAULT_OPTIONS,
 ) -> StoredDataset:
     """Store an uploaded file, or return the existing dataset of the same bytes.
 
@@ -136,12 +136,7 @@ def add_upload(
     UnreadableFile
         If the file cannot be used, with the position of the fault.
     """
-    read_as = {
-        "sha256": sha256,
-        "format": detect_kind(path, suffix),
-        "segments": list(segments),
-        "sample_time": sample_time,
-    }
+    read_as = {"sha256": sha256, "format": detect_kind(path, suffix), **options.list_given()}
     key = hash_source(read_as)
     _heal_object(database, store, path, sha256)
     with database.read_session() as session:
@@ -149,7 +144,7 @@ def add_upload(
     if existing is not None:
         return StoredDataset(existing, is_new=False)
     # Reading takes time. An open transaction would block all others on SQLite.
-    read = read_untrusted(path, limits, suffix=suffix, segments=segments, sample_time=sample_time)
+    read = read_untrusted(path, options, suffix=suffix)
     details = {"source": read_as, "warnings": list(read.notes)}
     return add_recording(
         database,
@@ -177,9 +172,7 @@ def derive_dataset(
         If it is long, and no place became free in time.
     """
     with database.read_session() as session:
-        parent = resolve_dataset(session, parent_id)
-        if isinstance(parent, str):
-            raise DatasetNotFound(parent)
+        parent = _find_parent(session, parent_id)
         existing = find_existing(session, store, _hash_derivation(parent, body))
     if existing is not None:
         return StoredDataset(existing, is_new=False)
@@ -201,6 +194,47 @@ def derive_dataset(
         },
         parents=[parent.id],
     )
+
+
+def join_datasets(database: Database, store: ObjectStore, body: JoinIn) -> StoredDataset:
+    """Join recordings on one clock; the same ones again return the same dataset.
+
+    Raises
+    ------
+    DatasetNotFound
+        If no dataset has that identifier or name, or several share the name.
+    InvalidRecord
+        If they cannot be joined.
+    """
+    from sysid.data.joining import join_recordings
+
+    with database.read_session() as session:
+        parents = [_find_parent(session, name) for name in body.datasets]
+        key = hash_source({"join": [parent.id for parent in parents]})
+        existing = find_existing(session, store, key)
+    if existing is not None:
+        return StoredDataset(existing, is_new=False)
+    shared = Counter(parent.name for parent in parents)
+    names = [one.name if shared[one.name] == 1 else one.id for one in parents]
+    recordings = [load_recording(store, parent.sha256) for parent in parents]
+    recording, notes = join_recordings(dict(zip(names, recordings, strict=True)))
+    return add_recording(
+        database,
+        store,
+        recording,
+        name=body.name or " + ".join(names)[:200],
+        kind="derive",
+        key=key,
+        details={"steps": [{"join": [parent.id for parent in parents]}], "warnings": list(notes)},
+        parents=[parent.id for parent in parents],
+    )
+
+
+def _find_parent(session: Session, name: str) -> Dataset:
+    parent = resolve_dataset(session, name)
+    if isinstance(parent, str):
+        raise DatasetNotFound(parent)
+    return parent
 
 
 def add_recording(

@@ -4,6 +4,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from typing import Any, NamedTuple
@@ -65,7 +66,7 @@ class SharedParts(NamedTuple):
         options, noise = self.options, self.options.noise or Noise()
         sigma, seed = cell.get("/noise/sigma", noise.sigma), cell.get("/noise/seed", noise.seed)
         return RunSpec(
-            self.problem.replace_noise(Noise(float(sigma), seed)),
+            self.problem.replace_noise(replace(noise, sigma=float(sigma), seed=seed)),
             self.algorithm,
             cell.get("/seed", options.seed),
             warm,

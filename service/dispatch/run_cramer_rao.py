@@ -42,7 +42,11 @@ from sysid.models.parse import parse_model
 from sysid.models.starts import compares_starts
 from sysid.simulation.problem import Problem
 from sysid.simulation.start_values import list_starts
-from sysid.uncertainty.cramer_rao import CramerRaoBound, cramer_rao_bound
+from sysid.uncertainty.cramer_rao import (
+    CramerRaoBound,
+    cramer_rao_bound,
+    measures_its_recursion,
+)
 from workers.errors import RecordsDelayed, RecordsUnavailable
 from workers.protocol import ProblemSpec
 from workers.tasks import prepare_run_records
@@ -51,7 +55,8 @@ _log = logging.getLogger(__name__)
 
 # Fields of a run that do not affect its reference values.
 IRRELEVANT_FIELDS = (
-    "/noise",
+    "/noise/sigma",
+    "/noise/seed",
     "/seed",
     "/algorithm",
     "/loss",
@@ -81,7 +86,7 @@ def build_bounds_maker(database: Database, parts: JobParts) -> DocumentMaker | N
     - ``reference``: ``kind`` (``truth``, or ``estimate``: the best run at the smallest σ), the
       ``run`` and ``sigma`` of an estimate, and ``values`` by parameter; or null;
     - ``stderr``: the bound of each free parameter for σ = 1, null if there is none;
-    - ``rms``: that of the response;
+    - ``rms``: that of the response; null for noise inside the plant, which moves it;
     - ``note``: why something is missing, or nothing.
     """
     spec = parts.job.spec
@@ -162,6 +167,12 @@ class _BoundsMaker:
         model = parse_model(spec.model)
         if model.rule is not None:
             return {"note": "no Cramér–Rao bound: the model selects its terms from the data"}
+        is_inside = spec.noise.place == "plant"
+        if is_inside and not measures_its_recursion(model):
+            return {
+                "note": "no Cramér–Rao bound: inside the plant there is one for recursions of one "
+                "state that is measured"
+            }
         records = {key: self._parts.load_records(key) for key in spec.record_keys}
         problem = Problem.build(
             model,
@@ -170,6 +181,7 @@ class _BoundsMaker:
             skip=spec.settings.skip,
             initial=spec.settings.initial,
             weights={output.name: 1.0 for output in model.outputs},
+            prediction="one-step" if is_inside else "simulation",
         )
         problem = _take_rest(problem, values)
         unknown = [name for name in problem.free_names if name not in values]
@@ -181,7 +193,8 @@ class _BoundsMaker:
         self._left -= work
         theta: FloatArray = np.array([values[name] for name in problem.free_names])
         with use_one_thread():
-            return _to_bounds_document(cramer_rao_bound(problem, theta))
+            bounds = _to_bounds_document(cramer_rao_bound(problem, theta))
+        return bounds | {"rms": None} if is_inside else bounds
 
 
 def _take_rest(problem: Problem, values: Mapping[str, float]) -> Problem:

@@ -8,30 +8,32 @@ from typing import Literal
 
 from sysid.core.errors import UnreadableFile
 
-FileKind = Literal["csv", "mcap", "excel", "parquet", "numpy", "matlab"]
+FileKind = Literal["csv", "mcap", "excel", "parquet", "numpy", "matlab", "json"]
 """``csv`` is every table in text, also compressed by gzip."""
 
 HEAD_BYTES = 65_536
 GZIP_MAGIC = b"\x1f\x8b"
 SUFFIXES = (
     *(".csv", ".txt", ".tsv", ".dat", ".asc", ".gz", ".mcap", ".mat", ".npz", ".npy"),
-    *(".xlsx", ".xlsm", ".xlsb", ".xls", ".ods", ".parquet"),
+    *(".xlsx", ".xlsm", ".xlsb", ".xls", ".ods", ".parquet", ".json", ".jsonl", ".ndjson"),
 )
 """Suffixes of files that are read; any text is read whatever its suffix."""
 
+_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_USER_BLOCK = 512  # bytes of MATLAB before those of HDF5
 _MAGICS: tuple[tuple[bytes, FileKind], ...] = (
     (b"\x89MCAP0\r\n", "mcap"),
     (b"PAR1", "parquet"),
     (b"\x93NUMPY", "numpy"),
     (b"MATLAB 5.0 MAT-file", "matlab"),
+    (b"MATLAB 7.3 MAT-file", "matlab"),
     (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "excel"),  # .xls
 )
 _MATLAB_ADVICE = (
     "in MATLAB, save arrays with save('file.mat', 't', 'u', 'y', '-v7'); else export CSV"
 )
 _REFUSED_MAGICS: tuple[tuple[bytes, str, str], ...] = (
-    (b"MATLAB 7.3 MAT-file", "a MATLAB 7.3 file (HDF5)", _MATLAB_ADVICE),
-    (b"\x89HDF\r\n\x1a\n", "an HDF5 file", _MATLAB_ADVICE),
+    (_HDF5_MAGIC, "an HDF5 file without the head of MATLAB", _MATLAB_ADVICE),
     (b"MDF ", "an ASAM MDF file", "export its signals as CSV or as MATLAB arrays"),
     (b"TDSm", "an NI TDMS file", "export its channels as CSV or Excel"),
     (b"ARROW1", "an Arrow (Feather) file", "write the table as Parquet"),
@@ -48,11 +50,6 @@ _REFUSED_MAGICS: tuple[tuple[bytes, str, str], ...] = (
 )
 _REFUSED_PATTERNS: tuple[tuple[re.Pattern[bytes], str, str], ...] = (
     (
-        re.compile(rb'(\xef\xbb\xbf)?\s*(\{\s*["}]|\[\s*[\[{"\d+-])'),
-        "JSON",
-        "write the signals as columns of a CSV file: t,u,y",
-    ),
-    (
         re.compile(rb"(\xef\xbb\xbf)?\s*<(\?xml|!doctype|html)", re.IGNORECASE),
         "XML or HTML",
         "export the table as CSV or Excel",
@@ -63,6 +60,7 @@ _REFUSED_PATTERNS: tuple[tuple[re.Pattern[bytes], str, str], ...] = (
         "write the table as Parquet or .npz",
     ),
 )
+_JSON = re.compile(rb'(\xef\xbb\xbf)?\s*(\{\s*["}]|\[\s*[\[{"\d+-])')
 _SHEET_PARTS = (b"[Content_Types].xml", b"_rels/", b"docProps/", b"xl/")
 _OPEN_SHEET = b"application/vnd.oasis.opendocument.spreadsheet"
 _MAX_MAT4_NAME = 64
@@ -101,6 +99,8 @@ def detect_head_kind(head: bytes, suffix: str = "") -> FileKind:
     if head.startswith(b"PK\x03\x04"):
         return _detect_archive_kind(head)
     _refuse_other_kinds(head)
+    if _JSON.match(head):
+        return "json"
     if suffix == ".mcap":
         return "mcap"
     return "matlab" if suffix == ".mat" or _is_mat4(head) else "csv"
@@ -142,6 +142,11 @@ def _detect_archive_kind(head: bytes) -> FileKind:
     if name.endswith(b".npy"):
         return "numpy"
     raise _build_refusal("a ZIP archive", "unpack it")
+
+
+def is_hdf5(path: Path) -> bool:
+    """Whether a MATLAB file is of version 7.3."""
+    return read_head(path)[_USER_BLOCK:].startswith(_HDF5_MAGIC)
 
 
 def _is_mat4(head: bytes) -> bool:

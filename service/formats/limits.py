@@ -36,21 +36,3 @@ class UploadLimits:
 
 
 DEFAULT_LIMITS = UploadLimits()
-
-
-@dataclass(frozen=True, slots=True)
-class ReadOptions:
-    """What the user says about a file, and the limits of reading it.
-
-    Attributes
-    ----------
-    sample_time : float or None
-        Sampling period in s, for a file without a time column.
-    segments : tuple of str
-        Columns of labels that divide the rows into segments.
-    limits : UploadLimits
-    """
-
-    sample_time: float | None = None
-    segments: tuple[str, ...] = ()
-    limits: UploadLimits = DEFAULT_LIMITS

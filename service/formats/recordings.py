@@ -4,15 +4,13 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeAlias, runtime_checkable
 
-import numpy as np
-
-from service.formats.advice import build_period_error
 from service.formats.file_kinds import GZIP_MAGIC, detect_kind, read_head
-from service.formats.limits import DEFAULT_LIMITS, ReadOptions, UploadLimits
-from sysid.core.errors import UnreadableFile
+from service.formats.read_options import DEFAULT_OPTIONS, Clock, ReadOptions, build_options
+from sysid.core.errors import InvalidRecord, UnreadableFile
 from sysid.data.foreign_tables import describe_value, is_labelled
+from sysid.data.joining import join_recordings
 from sysid.data.records import Recording
 from sysid.data.table_rules import tell_notes
 from sysid.inspection.inspect import check_recording
@@ -26,11 +24,19 @@ class Readable(Protocol):
         """Return the content that is left."""
 
 
+Source: TypeAlias = str | os.PathLike[str] | bytes | Readable
+"""A file's path, its content, or an open file."""
+
+
 def read_recording(
-    source: str | os.PathLike[str] | bytes | Readable,
+    source: Source | Sequence[Source],
     *,
     sample_time: float | None = None,
     segments: Sequence[str] | str = (),
+    columns: Sequence[str] | str = (),
+    missing: Sequence[str | float] | str = (),
+    exclude: Sequence[str] | str = (),
+    clock: Clock = "log",
 ) -> Recording:
     r"""Read a recording: text of columns, Excel, Parquet, NumPy, MATLAB or MCAP.
 
@@ -40,13 +46,25 @@ def read_recording(
 
     Parameters
     ----------
-    source : path, bytes or open file
-        A file's path, its content, or an object that can be read.
+    source : path, bytes or open file, or a sequence of them
+        A file's path, its content, or an object that can be read. Several files, each with its
+        own times, are joined on one clock; nothing is resampled.
     sample_time : float or None
         Sampling period in s, for a file without a time column.
     segments : sequence of str
         Columns of labels that divide the rows into segments, each measured on its own. A text
-        is one column.
+        has commas between names.
+    columns : sequence of str
+        Names of the columns of a file without a header, ``"t,u,,y [V]"``. A column with an empty
+        name is left out.
+    missing : sequence of str or float
+        Words and numbers that mark bad data, ``"-9999,Offline"``. If there are any, no other
+        number is taken for one; ``"none"`` says that no number is.
+    exclude : sequence of str
+        Ranges of times (s) or values, and words of a column: ``"t=100:200,flow=90:,state=Bad"``.
+        Rows of times or words are cut out, values are missing.
+    clock : {"log", "publish", "stamp"}
+        Times of an MCAP file: when a message was logged or sent, or the stamp in its header.
 
     Raises
     ------
@@ -64,26 +82,28 @@ def read_recording(
     >>> recording.names, recording.channel("flow").unit, recording.duration
     (('valve', 'flow'), 'l/min', 0.2)
     """
-    recording, notes = read_with_notes(source, sample_time=sample_time, segments=segments)
+    options = build_options(
+        sample_time=sample_time,
+        segments=segments,
+        columns=columns,
+        missing=missing,
+        exclude=exclude,
+        clock=clock,
+    )
+    recording, notes = read_with_notes(source, options)
     tell_notes((*notes, *(one.sentences for one in check_recording(recording))))
     return recording
 
 
 def read_with_notes(
-    source: str | os.PathLike[str] | bytes | Readable,
-    *,
-    sample_time: float | None = None,
-    segments: Sequence[str] | str = (),
-    limits: UploadLimits = DEFAULT_LIMITS,
+    source: Source | Sequence[Source], options: ReadOptions = DEFAULT_OPTIONS
 ) -> tuple[Recording, tuple[str, ...]]:
     """Read a recording, and return the notes with it; see `read_recording`.
 
     Plain text is read by this process, every other file by a child with limits.
     """
-    if sample_time is not None and not isinstance(sample_time, int | float | np.number):
-        raise build_period_error(sample_time)
-    labels = (segments,) if isinstance(segments, str) else tuple(segments)
-    options = ReadOptions(sample_time, labels, limits)
+    if isinstance(source, list | tuple):
+        return _read_several(source, options)
     content = source.read() if isinstance(source, Readable) else source
     if isinstance(content, str) and content is not source:
         content = content.encode()
@@ -106,6 +126,31 @@ def read_with_notes(
         raise
 
 
+def _read_several(
+    sources: Sequence[Source], options: ReadOptions
+) -> tuple[Recording, tuple[str, ...]]:
+    """Read files and join them on one clock; the notes of each name it."""
+    if not sources:
+        raise UnreadableFile("there is no file in the list; need one or more")
+    recordings: dict[str, Recording] = {}
+    notes: list[str] = []
+    for number, source in enumerate(sources, 1):
+        recording, told = read_with_notes(source, options)
+        if len(sources) == 1:
+            return recording, told
+        name = f"file {number}"
+        if isinstance(source, str | os.PathLike):
+            name = Path(source).stem
+        name = name if name not in recordings else f"{name} {number}"
+        recordings[name] = recording
+        notes += [f"{name}: {note}" for note in told]
+    try:
+        recording, joined = join_recordings(recordings)
+    except InvalidRecord as error:
+        raise UnreadableFile(str(error)) from None
+    return recording, (*notes, *joined)
+
+
 _NO_FILE = " A table is a recording already: give it to identify, or to Recording"
 
 
@@ -116,13 +161,11 @@ def _read_file(path: Path, options: ReadOptions) -> tuple[Recording, tuple[str, 
         raise FileNotFoundError(f"there is no file {path}")
     from service.formats.tabular.csv_recordings import read_csv
 
-    sample_time, segments, limits = options.sample_time, options.segments, options.limits
     is_packed = read_head(path).startswith(GZIP_MAGIC)  # unpacking needs limits
-    if detect_kind(path, path.suffix) == "csv" and not is_packed:
-        return read_csv(path, sample_time=sample_time, segments=segments, limits=limits)
+    is_plain = detect_kind(path, path.suffix) == "csv" and not is_packed
+    if is_plain and options.clock == DEFAULT_OPTIONS.clock:
+        return read_csv(path, options)
     from service.formats.sandbox import read_untrusted
 
-    upload = read_untrusted(
-        path, limits, suffix=path.suffix, sample_time=sample_time, segments=segments
-    )
+    upload = read_untrusted(path, options, suffix=path.suffix)
     return upload.recording, upload.notes

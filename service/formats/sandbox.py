@@ -8,7 +8,7 @@ import json
 import os
 import subprocess
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from hashlib import file_digest
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,8 +17,9 @@ from typing import Any
 from service.core.errors import Unavailable
 from service.core.process import temporary_files
 from service.formats.file_kinds import detect_kind
-from service.formats.limits import DEFAULT_LIMITS, MIB, UploadLimits
+from service.formats.limits import MIB, UploadLimits
 from service.formats.mcap.mcap_files import read_mcap
+from service.formats.read_options import DEFAULT_OPTIONS, ReadOptions
 from sysid.core.child_processes import OUT_OF_PROCESSOR_TIME, run_child
 from sysid.core.errors import Advice, UnreadableFile
 from sysid.data.records import Recording
@@ -45,12 +46,7 @@ class UploadedRecording:
 
 
 def read_untrusted(
-    path: str | os.PathLike[str],
-    limits: UploadLimits = DEFAULT_LIMITS,
-    *,
-    suffix: str = "",
-    sample_time: float | None = None,
-    segments: Sequence[str] = (),
+    path: str | os.PathLike[str], options: ReadOptions = DEFAULT_OPTIONS, *, suffix: str = ""
 ) -> UploadedRecording:
     """Read an uploaded file of any kind.
 
@@ -58,8 +54,6 @@ def read_untrusted(
     ----------
     suffix : str
         Suffix of the name that the user gave the file; see `file_kinds.detect_kind`.
-    sample_time, segments
-        See `service.formats.tabular.csv_recordings.read_csv`.
 
     Raises
     ------
@@ -68,7 +62,7 @@ def read_untrusted(
     Unavailable
         If the disk of temporary files is full.
     """
-    source = Path(path)
+    source, limits = Path(path), options.limits
     size = source.stat().st_size
     if size > limits.file_bytes:
         raise UnreadableFile(f"the file has {size} bytes; at most {limits.file_bytes} are read")
@@ -80,9 +74,7 @@ def read_untrusted(
             "source": str(source.absolute()),
             "target": str(clean),
             "kind": detect_kind(source, suffix),
-            "sample_time": sample_time,
-            "segments": list(segments),
-            "limits": asdict(limits),
+            "options": options.to_document(),
         }
         notes = _parse_answer(_run_child(task, limits, folder), limits)
         return UploadedRecording(read_mcap(clean, limits), notes, sha256)

@@ -24,6 +24,7 @@ from service.jobs.record_checks import (
     list_record_lengths,
     override_by_request,
 )
+from service.jobs.to_core import read_noise
 from service.models import models
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
@@ -74,6 +75,7 @@ class JobChecker:
         faults += self._find_length_faults(body, tied, model_parameters)
         faults += self._find_sample_faults(body, model, parameters)
         faults += self._find_unit_faults(body, model)
+        faults += _find_noise_faults(body, model)
         faults += warm_starts.find_warm_start_faults(self._session, body["warm_start"], model)
         return faults + list(find_signal_faults(body, model))
 
@@ -247,6 +249,17 @@ def _find_unused_parameters(
         FieldError(fault.pointer, fault.detail)
         for fault in find_unused_settings(model, parameters, weights)
     ]
+
+
+def _find_noise_faults(body: JobBody, model: Model) -> list[FieldError]:
+    """Find why noise has no place inside the plant."""
+    noise, faults = read_noise(body), list[FieldError]()
+    if noise.place == "plant":
+        # This import loads the compiler, which most requests never need.
+        from sysid.simulation.process_noise import check_process_noise
+
+        collect_faults(check_process_noise, faults, model, noise)
+    return faults
 
 
 def _list_dataset_references(body: JobBody) -> Iterator[tuple[str, str]]:

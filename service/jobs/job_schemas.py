@@ -13,7 +13,7 @@ from pydantic_core import PydanticCustomError
 from service.core.bodies.derived_bodies import derive_fields, take_setting
 from service.core.bodies.wire import Answer, Body, Cell, DescribedBy, Labels, Page, Pointer
 from service.core.states import StateName
-from service.datasets.dataset_schemas import NoiseIn
+from service.datasets.dataset_schemas import PlacedNoiseIn
 from service.items.reference_names import REFERENCE_PREFIX, RUN_PREFIX
 from sysid.core.settings import (
     FitSettings,
@@ -306,7 +306,9 @@ class JobIn(IdentificationIn):
     validation: ValidationIn | None = Field(
         default=None, description="data that are compared, but not fitted"
     )
-    noise: NoiseIn = Field(default=NoiseIn(), description="noise that is added before fitting")
+    noise: PlacedNoiseIn = Field(
+        default=PlacedNoiseIn(), description="noise that is added before fitting"
+    )
     seed: int = take_setting(RunOptions, "seed")
     sweep: SweepIn = Field(default=SweepIn(), description="fields that change from run to run")
     warm_start: Annotated[str, Field(max_length=300), AfterValidator(_check_warm_start)] | None = (

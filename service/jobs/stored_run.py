@@ -128,6 +128,7 @@ class StoredRun:
         validation = self.body["validation"] or {}
         others = validation.get("datasets")
         return prepare_records(
+            self.model_of_request,
             self.read_datasets(session, store, self.body["datasets"]),
             None if others is None else self.read_datasets(session, store, others),
             validation.get("fraction"),

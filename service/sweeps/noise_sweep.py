@@ -1,4 +1,4 @@
-"""Noise sweep: effect of output noise on the estimates (Figure 15).
+"""Noise sweep: effect of noise on the estimates, of outputs or inside the plant (Figure 15).
 
 Draws depend only on the sweep's seed and the replicate. A run therefore keeps its specification if
 the grid of σ or the number of replicates grows. Its result is then reused (`service.queue.reuse`).
@@ -140,13 +140,15 @@ def _build_base(
     """
     name = body.name or "noise sweep"
     fields = {**body.job_fields, "name": name, "datasets": source.datasets}
+    if body.place == "plant" and body.truth is not None:
+        fields["noise"] = {"place": body.place, "parameters": body.truth.parameters}
     job = JobIn.model_validate(fields)
     checker = JobChecker(session, source.new_rows)
     faults = [*_grid_faults(body, most_runs), *source.faults]
     faults += (
         fault
         for fault in checker.find_faults(job.to_normal_form())
-        if not (source.is_missing and fault.pointer.startswith("/datasets"))
+        if not (source.is_missing and fault.pointer.startswith(("/datasets", "/noise")))
     )
     rows = [
         dataset
@@ -202,5 +204,7 @@ def _list_moved_pointers(body: NoiseSweepIn) -> Iterator[tuple[str, str]]:
     yield "/sweep/axes/0/values", "/sigma"
     yield "/sweep/axes/0", "/sigma"
     yield "/sweep/axes/3/values", "/methods"
+    yield "/noise/place", "/place"
     if body.truth is not None:
         yield "/datasets/0", "/truth"
+        yield "/noise/parameters", "/truth/parameters"

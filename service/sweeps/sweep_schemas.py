@@ -10,6 +10,7 @@ from service.core.bodies.wire import Answer, Body, Cell, Sigma
 from service.datasets.dataset_schemas import MAX_SIMULATED_SAMPLES, InputIn, SampleTime
 from service.jobs.job_schemas import IdentificationIn, TrendX, ValidationIn
 from sysid.core.settings import SearchMethod
+from sysid.data.noise import Noise, NoisePlace
 from sysid.identification.options import RunOptions
 
 MAX_REPLICATES = 1_000_000
@@ -43,7 +44,9 @@ class NoiseSweepIn(IdentificationIn):
     search with `seed` · 10⁶ + r, at every σ and for every method. Another grid or more replicates
     therefore leave the other runs unchanged, and these are not computed again.
 
-    With `relative`, σ is in standard deviations of the output. The other fields are those of a job.
+    With `relative`, σ is in standard deviations of the output. At the `place` plant, σ is the noise
+    of each sample of a recursion, as φ of the paper, or else per √s; the record is simulated from
+    `truth`. The other fields are those of a job.
     """
 
     truth: TruthIn | None = Field(default=None, description="record to simulate, without noise")
@@ -59,6 +62,7 @@ class NoiseSweepIn(IdentificationIn):
     relative: bool = Field(
         default=False, description="whether `sigma` is in standard deviations of the output"
     )
+    place: NoisePlace = take_setting(Noise, "place")
     replicates: int = Field(
         default=20, ge=1, lt=MAX_REPLICATES, description="runs for each level and method"
     )
@@ -75,6 +79,10 @@ class NoiseSweepIn(IdentificationIn):
             raise PydanticCustomError(
                 "one_of",
                 "give either 'truth' (true parameters and inputs to simulate) or 'datasets'",
+            )
+        if self.place == "plant" and self.truth is None:
+            raise PydanticCustomError(
+                "one_of", "noise inside the plant needs 'truth', from which it is simulated"
             )
         return self
 

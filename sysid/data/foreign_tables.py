@@ -253,7 +253,7 @@ def to_frame(columns: Sequence[Column]) -> Any:
     pandas = load_library("pandas", "to_pandas()")
     series = []
     for column in columns:
-        seconds, start = column.axis
+        seconds, start, _ = column.axis
         index = pandas.Index(seconds, name="t")
         if start is not None:
             spans = pandas.to_timedelta(np.round(seconds * 1e9).astype(np.int64))

@@ -4,7 +4,8 @@ Interpretation of Eq. 19: φ = χ + σξ, so `sigma` is a standard deviation. Of
 in (0, 1), so that ξ = (Σψ − N/2)/√(N/12) has mean 0, variance 1 and excess kurtosis −1.2/N.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
@@ -14,13 +15,14 @@ from sysid.core.settings import Bounds, check_settings
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
 
+NoisePlace = Literal["sensor", "plant"]
 NoiseKind = Literal["gaussian", "uniform-sum"]
 NOISE_KINDS: tuple[NoiseKind, ...] = get_args(NoiseKind)
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Measurement noise of every output.
+    """Noise that is added before fitting: to every output, or inside the plant.
 
     Attributes
     ----------
@@ -34,11 +36,17 @@ class Noise:
         N ≥ 3 of Eq. 20 of the paper.
     mean : float
         χ of Eq. 19 of the paper.
+    place : NoisePlace
+        ``plant``: φ of Eq. 13 and 16, where the model's document says that noise enters. The
+        record is simulated again with it. Then `sigma` is that of each sample of a recursion, or
+        else per √s, in the unit of the state.
+    parameters : mapping of str to float
+        True parameters of that simulation.
 
     Examples
     --------
     >>> Noise(sigma=0.05, seed=1)
-    Noise(sigma=0.05, seed=1, kind='gaussian', terms=12, mean=0.0)
+    Noise(sigma=0.05, seed=1, kind='gaussian', terms=12, mean=0.0, place='sensor', parameters={})
     """
 
     sigma: Annotated[float, Bounds(least=0)] = 0.0
@@ -46,10 +54,13 @@ class Noise:
     kind: NoiseKind = "gaussian"
     terms: Annotated[int, Bounds(least=3)] = 12
     mean: float = 0.0
+    place: NoisePlace = "sensor"
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the fields as they are: every run of a noise sweep has its own."""
-        return Noise, (self.sigma, self.seed, self.kind, self.terms, self.mean)
+        own = (self.sigma, self.seed, self.kind, self.terms, self.mean, self.place, self.parameters)
+        return Noise, own
 
     def __post_init__(self) -> None:
         check_settings(self, "/noise")

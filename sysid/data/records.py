@@ -108,6 +108,8 @@ class Channel:
     started_at : datetime or None
         Moment of time 0 s; the first date if the times were dates. A `Record` or a `Recording`
         keeps the distance of channels that have one.
+    time_unit : str
+        Unit in which the source had the times, such as ``min``; estimates are shown in it too.
 
     Raises
     ------
@@ -129,6 +131,7 @@ class Channel:
     history: History | None = None
     started_at: datetime | None = None
     repeats: FloatArray | None = None
+    time_unit: str = "s"
     _choice: HoldChoice | None = field(default=None, init=False, repr=False)
 
     if TYPE_CHECKING:
@@ -143,6 +146,7 @@ class Channel:
             history: History | None = None,
             started_at: datetime | None = None,
             repeats: FloatArray | None = None,
+            time_unit: str = "s",
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -388,8 +392,8 @@ def to_channel(column: Column, otherwise: str = "") -> Channel:
 
     What is refused of a file is so of a table: infinite values, and times that repeat.
     """
-    name, (times, start) = column.name or otherwise, column.axis
-    channel = Channel(name, times, column.values, column.unit, started_at=start)
+    name, (times, start, unit) = column.name or otherwise, column.axis
+    channel = Channel(name, times, column.values, column.unit, started_at=start, time_unit=unit)
     repeated = np.flatnonzero(np.diff(channel.times) == 0)
     if repeated.size:
         raise InvalidRecord(
@@ -852,7 +856,7 @@ def _to_frame(channels: Sequence[Channel]) -> Any:
                 append_unit(channel.name, channel.unit),
                 channel.name,
                 channel.unit,
-                TimeAxis(channel.times, channel.started_at),
+                TimeAxis(channel.times, channel.started_at, channel.time_unit),
                 channel.values,
             )
             for channel in channels

@@ -107,10 +107,14 @@ class Heading(NamedTuple):
 
 
 class TimeAxis(NamedTuple):
-    """Times (s), and the moment of time 0 s if it is known; a zone only if the source has one."""
+    """Times (s), and the moment of time 0 s if it is known; a zone only if the source has one.
+
+    `unit` is the unit in which the source has them.
+    """
 
     seconds: FloatArray
     started_at: datetime | None = None
+    unit: str = "s"
 
 
 class DatedAxis(NamedTuple):
@@ -156,10 +160,11 @@ def is_nameless(heading: Heading) -> bool:
 
 def is_index_name(name: str) -> bool:
     """Whether a column of this name is left out if it counts rows: ``No.``, ``Sample #``, none."""
-    return name.lower() in NO_NAMES or _simplify_name(name).removesuffix(".") in _INDEX_WORDS
+    return name.lower() in NO_NAMES or simplify_name(name).removesuffix(".") in _INDEX_WORDS
 
 
-def _simplify_name(name: str) -> str:
+def simplify_name(name: str) -> str:
+    """Return a name in small letters, with one blank between its words."""
     return " ".join(re.sub(r"[_-]", " ", name.lower()).split())
 
 
@@ -222,7 +227,7 @@ def is_time_name(name: str) -> bool:
 
 def find_time_word(name: str) -> str | None:
     """Return the usual name of time that a name is, without a unit at its end."""
-    text = _simplify_name(name)
+    text = simplify_name(name)
     if text in _TIME_WORDS:
         return text
     word, _, unit = text.rpartition(" ")
@@ -280,7 +285,8 @@ def read_number_times(values: FloatArray, name: str, unit: str, notes: list[str]
             notes.append(
                 f"times were converted from {unit} to s: delays and time constants are in s"
             )
-        return TimeAxis(_scale_times(values, size))
+        name = _LONG_UNITS.get(unit.lower(), unit) if size != 1.0 else "s"
+        return TimeAxis(_scale_times(values, size), unit=name)
     origin = float(values[0])
     shown = f"{origin:.0f}" if origin >= _EXACT_INTEGER else repr(origin)
     shifted = np.round(_scale_times(values - origin, size), _EXACT_DECIMALS if size == 1.0 else 9)

@@ -12,7 +12,7 @@ from math import ceil
 from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
 from sysid.core.settings import FILTERED
 from sysid.export.program import GeneratedProgram
-from sysid.kernels.signals.past_reads import list_delayed_values
+from sysid.kernels.signals.past_reads import is_difference, list_delayed_values
 from sysid.language.delays import has_varying_delay, mentions_time
 from sysid.language.evaluation import evaluate_expression
 from sysid.language.tree import Expression
@@ -64,15 +64,18 @@ class Observer:
 def build_observer(identified: IdentifiedModel, result: Result) -> Observer | None:
     """Build the observer of a result; None if no noise acts inside the plant, or it has none.
 
-    It has none if samples are irregular, if the model has a grid, a history or switches of its own
-    time, or if a lag follows an input.
+    It has none if the model is a recursion, if samples are irregular, if the model has a grid, a
+    history or switches of its own time, or if a lag follows an input.
     """
     noise, period = result.noise_model, identified.sample_time
     if result.plant_noise is None or noise not in FILTERED or period is None:
         return None
-    scales = NoiseScales({}, period, 1e3 * period)  # of bounds, which an observer does not have
+    if is_difference(identified.model):
+        return None
+    # of bounds, which an observer does not have
+    scales = NoiseScales({}, period, 1e3 * period, period)
     plain = replace_substeps(identified.model, result.substeps)
-    model = add_kalman_filter(plain, noise, scales)
+    model = add_kalman_filter(plain, noise, scales, {})
     if _has_own_time(model):
         return None
     values = tuple(

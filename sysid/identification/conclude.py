@@ -343,6 +343,7 @@ def _build_identification(
         else problem.settings.deviations,
         residual_tests=tests,
         onset_delays=estimate_onset_delays(problem.model, problem.records),
+        time_unit=(*problem.records[0].inputs, *problem.records[0].outputs)[0].time_unit,
         data_bounds=tuple(p.name for p in problem.free_parameters if p.bounds is not None),
         input_hold=holds,
         commands=problem.settings.commands or (),

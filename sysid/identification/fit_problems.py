@@ -6,12 +6,13 @@ from typing import NamedTuple, TypeAlias
 
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import FitSettings
-from sysid.data.noise import Noise, add_output_noise
+from sysid.data.noise import Noise
 from sysid.data.records import Record
 from sysid.data.splitting import find_validation_start, split_record
 from sysid.models.model import Model
 from sysid.selection.select import select_model_terms
 from sysid.simulation.problem import Problem
+from sysid.simulation.process_noise import add_noise
 
 ProblemPair: TypeAlias = tuple[Problem, Problem | None]
 """A problem, and that of its validation data if there are any."""
@@ -39,6 +40,7 @@ class FitRecords(NamedTuple):
 
 
 def prepare_records(
+    model: Model,
     records: Sequence[Record],
     validation: Sequence[Record] | None = None,
     fraction: float | None = None,
@@ -56,13 +58,14 @@ def prepare_records(
     Raises
     ------
     InvalidSettings
-        If there are both, or if the fraction leaves a part without samples.
+        If there are both, or if the fraction leaves a part without samples. Also if the noise has
+        no place in the model.
     """
     whole = tuple(records)
     noise = noise or Noise()
     if fraction is None:
         other = None if validation is None else tuple(validation)
-        return FitRecords(_add_noise(whole, noise), other, other, None)
+        return FitRecords(_add_noise(model, whole, noise), other, other, None)
     if validation is not None:
         raise InvalidSettings("/validation", "give either records or a fraction")
     parts = [split_record(record, fraction) for record in whole]
@@ -71,7 +74,7 @@ def prepare_records(
     last, runs = (
         tuple(map(_adopt_holds, later, first)) for later in ([part[1] for part in parts], whole)
     )
-    return FitRecords(_add_noise(first, noise), last, runs, starts)
+    return FitRecords(_add_noise(model, first, noise), last, runs, starts)
 
 
 def build_problems(model: Model, records: FitRecords, settings: FitSettings) -> ProblemPair:
@@ -109,5 +112,5 @@ def _adopt_holds(record: Record, estimation: Record) -> Record:
     return replace(record, inputs=tuple(replace(channel, hold=hold) for channel, hold in pairs))
 
 
-def _add_noise(records: tuple[Record, ...], noise: Noise) -> tuple[Record, ...]:
-    return tuple(add_output_noise(record, noise, number) for number, record in enumerate(records))
+def _add_noise(model: Model, records: tuple[Record, ...], noise: Noise) -> tuple[Record, ...]:
+    return tuple(add_noise(model, record, noise, number) for number, record in enumerate(records))

@@ -185,7 +185,9 @@ def identify_records(
     """
     check_unused_settings(model, len(records), fit.parameters, fit.weights)
     check_signal_units(model, (*records, *(validation or ())))
-    prepared = prepare_records(records, validation, options.validation_fraction, options.noise)
+    prepared = prepare_records(
+        model, records, validation, options.validation_fraction, options.noise
+    )
     problem, validation_problem = problems = build_problems(model, prepared, fit)
     check_warm(options.warm, [parameter.name for parameter in problem.all_parameters])
     if tell is not None:

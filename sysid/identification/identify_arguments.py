@@ -169,7 +169,7 @@ def _read_one(
 def _read_others(columns: Sequence[Column]) -> Iterator[Channel]:
     """Read columns that the model does not use; those without numbers are left out."""
     for column in columns:
-        times, start = column.axis
+        times, start, _ = column.axis
         with suppress(InvalidRecord):
             channel = Channel(column.name, times, column.values, column.unit, started_at=start)
             if find_infinite_value([channel]) is None:

@@ -7,6 +7,7 @@ import numpy as np
 
 from sysid.core.types import FloatArray
 from sysid.core.units import is_blank_unit
+from sysid.kernels.signals.past_reads import is_difference
 from sysid.models.kalman_filter import is_noise_parameter
 from sysid.results.parts import NoiseSource, PlantNoise
 from sysid.simulation.data_bounds import list_units
@@ -53,4 +54,5 @@ def _list_sources(
             yield NoiseSource(place, "load", size, units[place], values[f"tau[{place}]"])
         elif kind == "noise":
             unit = "1" if is_blank_unit(units[place]) else units[place]
-            yield NoiseSource(place, "plant", size, f"{unit}/√s", None)
+            per = "" if is_difference(problem.model) else "/√s"
+            yield NoiseSource(place, "plant", size, f"{unit}{per}", None)

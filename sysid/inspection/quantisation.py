@@ -10,13 +10,13 @@ import numpy as np
 from sysid.core.findings import Finding
 from sysid.inspection.signal import Signal, build_finding
 
-_GRID_TOLERANCE = 1e-3  # of a step
+_GRID_TOLERANCE = 0.02  # of a step: values are printed with few digits
 _MIN_STAIRS, _MIN_MOVES, _ONE_STEP = 4, 10, 1.5
 """Levels and moves of a signal that goes from each level to a neighbour alone. Levels that somebody
 chose are not so: of five drawn at random, ten moves are in one of 8,000 cases."""
 _MIN_LEVELS = 8
 _SAMPLES_PER_LEVEL = 4
-_COARSE = 5.0  # steps that a signal moves from sample to sample, in the middle
+_STILL_SHARE = 0.25  # of the samples, that equal the one before: white noise of a step has 28 %
 
 
 def find_quantum(signal: Signal) -> float | None:
@@ -24,8 +24,9 @@ def find_quantum(signal: Signal) -> float | None:
     if not signal.is_told or not signal.quantum > 0:
         return None
     levels = signal.levels
-    counts = (levels - levels[0]) / signal.quantum
-    if np.max(np.abs(counts - np.rint(counts))) > _GRID_TOLERANCE * max(counts[-1], 1.0):
+    count = np.rint((levels[-1] - levels[0]) / signal.quantum)
+    counts = (levels - levels[0]) * (count / (levels[-1] - levels[0]))
+    if np.max(np.abs(counts - np.rint(counts))) > _GRID_TOLERANCE:
         return None
     moves = np.abs(signal.steps[signal.steps != 0])
     is_stair = moves.size >= _MIN_MOVES and _MIN_STAIRS <= levels.size <= moves.size / 2
@@ -33,7 +34,7 @@ def find_quantum(signal: Signal) -> float | None:
         return signal.quantum
     if signal.is_held or not _MIN_LEVELS <= levels.size <= signal.values.size / _SAMPLES_PER_LEVEL:
         return None
-    return signal.quantum if np.median(moves) <= _COARSE * signal.quantum else None
+    return signal.quantum if np.mean(signal.steps == 0) >= _STILL_SHARE else None
 
 
 def find_quantisation(signal: Signal) -> Iterator[Finding]:

@@ -51,7 +51,7 @@ def find_repeats(signal: Signal) -> Iterator[Finding]:
             "empty.",
         )
         return
-    if stuck := list(_find_stuck(signal)):
+    if signal.role != "input" and (stuck := list(_find_stuck(signal))):
         where = ", ".join(f"{first:.6g} to {last:.6g} s" for first, last in stuck[:3])
         yield build_finding(
             "repeated reading",

@@ -11,6 +11,10 @@ from sysid.inspection.signal import Signal, build_finding
 _LINE_SHARE = 1e-6  # of the range: a bend
 _DRAWN_SHARE = 0.1  # of the samples that lie on lines; of measured ones none does
 _ONE_STEP, _PILED = 1.5, 3.0  # steps of the values; samples on lines for each that bends by one
+_EVEN_SHARE = 0.8  # of the lines, as long as their median give or take a sample: an even clock
+_MOST_KNOTS = (
+    4  # samples: a bend between two samples of the grid shows at two, and lines have two ends
+)
 _LONG_LINE = 20  # samples: a command along longer lines is a ramp
 
 
@@ -46,9 +50,7 @@ def find_resampling(signal: Signal) -> Iterator[Finding]:
         return
     is_knot = find_knots(signal.times, signal.values)
     share = measure_drawn(signal.values, is_knot)
-    lines = np.diff(np.flatnonzero(is_knot))
-    lines = lines[lines > 1]
-    if share <= _DRAWN_SHARE or float(np.median(lines)) > _LONG_LINE:
+    if share <= _DRAWN_SHARE or not _are_even(is_knot):
         return
     yield build_finding(
         "interpolated reading",
@@ -57,4 +59,21 @@ def find_resampling(signal: Signal) -> Iterator[Finding]:
         "their neighbours: they were interpolated, and are no measurements.",
         (signal.name,),
         advice=f"Keep the measured rows of {signal.name}, and leave the others empty.",
+    )
+
+
+def _are_even(is_knot: BoolArray) -> bool:
+    """Whether lines come evenly, as between the samples of a slower clock.
+
+    A signal that was simulated is nearly straight where it is slow, and bent elsewhere. A command
+    along ramps has long lines.
+    """
+    edges = np.flatnonzero(np.diff(is_knot)) + 1
+    lengths = np.diff(np.concatenate([[0], edges, [is_knot.size]]))
+    bent, straight = lengths[::2], lengths[1::2]  # the first sample is a knot
+    middle = float(np.median(straight))
+    return bool(
+        middle <= _LONG_LINE
+        and np.mean(np.abs(straight - middle) <= 1) >= _EVEN_SHARE
+        and np.mean(bent <= _MOST_KNOTS) >= _EVEN_SHARE
     )

@@ -158,8 +158,8 @@ class _Block:
     def _emit_start(self, scope: ParameterEnvironment) -> list[IrValue]:
         """Emit the initial values: numbers of the experiment, rows of theta, or expressions."""
         names = [signal.name for signal in self.model.inputs]
-        first_inputs = dict(zip(names, self.experiment.first_inputs, strict=True))
-        environment = StartEnvironment(scope.values, scope.period, first_inputs)
+        first_values = dict(zip(names, self.experiment.first_inputs, strict=True))
+        environment = StartEnvironment(scope.values, scope.period, first_values)
         values = []
         for i, initial in enumerate(self.model.initial):
             value = self.experiment.initial[i]
@@ -169,6 +169,7 @@ class _Block:
                 derived = emit_expression(self.lanes, initial.expression, environment)
                 value = self.lanes.add(derived, value)
             values.append(value)
+            first_values[self.model.states[i].name] = value  # a lagged state starts there too
         return values
 
     def _emit_following_states(
@@ -180,7 +181,8 @@ class _Block:
     ) -> dict[str, IrValue]:
         """Emit the next states: computed, or in the first samples of a recursion measured."""
         lanes, model = self.lanes, self.model
-        if not past_reads.is_difference(model) or model.memory <= 1:
+        is_computed = not past_reads.is_difference(model) or model.memory <= 1
+        if is_computed or model.corrections:  # a filter holds its first states by itself
             return emit_next_states(
                 lanes, model, self.experiment.get_number("step"), states, build_environment
             )

@@ -1,7 +1,7 @@
-"""Derivative of an expression by the present value of a state.
+"""Derivative of an expression by a value of a state, now or in the past.
 
-Values of the past do not depend on it. A jump has no derivative, and a bend has that of the side on
-which the state is.
+Its values at other times do not depend on it. A jump has no derivative, and a bend has that of the
+side on which the state is.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,8 +17,8 @@ class NoDerivativeError(Exception):
     """A function whose derivative the language cannot express."""
 
 
-def differentiate(tree: Expression, state: str) -> Expression:
-    """Differentiate an expression by the present value of a state.
+def differentiate(tree: Expression, value: PastValue) -> Expression:
+    """Differentiate an expression by a value of a state; a value with a delay is another one.
 
     Raises
     ------
@@ -28,27 +28,26 @@ def differentiate(tree: Expression, state: str) -> Expression:
     Examples
     --------
     >>> x = PastValue("x", "state")
-    >>> differentiate(Binary("*", Number(3.0), x), "x")
+    >>> differentiate(Binary("*", Number(3.0), x), x)
     Number(value=3.0)
     """
-    present = PastValue(state, "state")
-    if present not in walk(tree):
+    if value not in walk(tree):
         return ZERO
     match tree:
         case PastValue():
-            return ONE if tree == present else ZERO
+            return ONE if tree == value else ZERO
         case Unary(_, operand):
-            return subtract(ZERO, differentiate(operand, state))
+            return subtract(ZERO, differentiate(operand, value))
         case Binary(operator, left, right):
-            dleft, dright = differentiate(left, state), differentiate(right, state)
+            dleft, dright = differentiate(left, value), differentiate(right, value)
             return _differentiate_operation(operator, left, right, dleft, dright)
         case FunctionCall(function, arguments):
-            slopes = tuple(differentiate(argument, state) for argument in arguments[1:])
+            slopes = tuple(differentiate(argument, value) for argument in arguments[1:])
             if function == "where":
                 return _choose(arguments[0], *slopes)
             if function not in _RULES:
                 raise NoDerivativeError(function)
-            return _RULES[function](arguments, (differentiate(arguments[0], state), *slopes))
+            return _RULES[function](arguments, (differentiate(arguments[0], value), *slopes))
     return ZERO
 
 

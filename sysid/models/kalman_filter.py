@@ -7,33 +7,40 @@ loads and its covariance P to the states of the model, so that one integrator se
     P' = A P + P Aᵀ + Q,  A = ∂f/∂x     between samples
     x ← x + P c (y - ŷ)/S,  P ← P - P c cᵀ P/S,  S = 1 + cᵀ P c,  c = ∂h/∂x     at a sample
 
-(Jazwinski 1970, Theorem 8.1; Kristensen, Madsen and Jørgensen, Automatica 40 (2004) 225.) All
-deviations are relative to that of the sensor, so its variance is 1 here and has a closed form in
-the likelihood. A linear model with lags of inputs has its exact filter. Others have the extended
-one, in which delayed states count as known.
+(Jazwinski 1970, Theorem 8.1; Kristensen, Madsen and Jørgensen, Automatica 40 (2004) 225.) In a
+recursion noise is added to each sample of a state, as φ(k) of Eq. 16. Its fixed lags become states
+(`sysid.models.lagged_states`), and P moves from sample to sample::
+
+    d(k) = ρ d(k-1) + √(1 - ρ²) λ·w,  ρ = exp(-h/τ);    P ← A P Aᵀ + G Q Gᵀ
+
+All deviations are relative to that of the sensor, so its variance is 1 here and has a closed form
+in the likelihood. A linear model whose states have no delays, or short ones in a recursion, has its
+exact filter. Others have the extended one, in which delayed states count as known.
 
 A load enters where its input does, but without the input's delay: before or after a dead time is
 the same for a stationary process. The innovations y - ŷ are the residuals, and their sum of squares
 is minimised: the filter-error method (Maine and Iliff 1981) in innovations form.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from math import sqrt
-from typing import Literal, NamedTuple
+from math import inf, sqrt
+from typing import Any, Literal, NamedTuple
 
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import FILTERED, NoiseModel, PlantNoise
 from sysid.core.units import divide_units, is_blank_unit
 from sysid.language.delays import collect_past_values
 from sysid.language.derivative import (
+    ONE,
     ZERO,
     NoDerivativeError,
     add,
     differentiate,
     multiply,
 )
+from sysid.language.transform import substitute
 from sysid.language.tree import (
     Binary,
     Expression,
@@ -44,21 +51,34 @@ from sysid.language.tree import (
     Unary,
     match_plain_state,
 )
+from sysid.models.covariance import (
+    Pair,
+    Slopes,
+    StateCovariance,
+    Tangent,
+    follow_rates,
+    follow_recursion,
+    is_covariance,
+    list_noisy,
+    make_rate,
+    make_step,
+)
+from sysid.models.lagged_states import add_lagged_states, hold_first_samples
 from sysid.models.model import (
     Correction,
     DerivedInitial,
     FixedInitial,
+    MeasuredInitial,
     Model,
     ModelSignal,
     Output,
 )
-from sysid.models.parameters import Parameter
+from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.rest import NoRestError, solve_rest
 from sysid.models.sections import STEADY, get_interval
 
-_Pair = tuple[str, str]
-_Slopes = Mapping[_Pair, Expression]
-_Covariance = Mapping[frozenset[str], PastValue]
+ParameterChanges = Mapping[str, Mapping[str, Any]]
+"""Changes of parameters by name, such as ``{"L": {"upper": 2.0}}``."""
 
 _PARAMETERS = ("load", "tau", "noise")
 _SMALLEST, _LARGEST = 1e-3, 1e3  # deviation of a load at its input over the sensor's, by spans
@@ -66,6 +86,8 @@ _ANY_LOWER, _ANY_UPPER = 1e-100, 1e100  # of a size, before the data are known
 _LONGEST = 10.0  # of the record: correlation time of a load
 _SPAN = 4.0  # of an output in its deviations
 _LEAST_SHARE, _MOST_SHARE = 1e-2, 1e4  # of the sensor's deviation: diffusion over the record
+_GROWTH = 1.5  # power of the samples with which noise of each grows when it is summed twice
+_UNKNOWN = 1e6  # variance of a measured start over the sensor's: rounding grows with its square
 
 
 def is_noise_parameter(name: str) -> bool:
@@ -90,11 +112,14 @@ class NoiseScales:
         Span of each input and output.
     period, duration : float
         Sampling period and duration (s).
+    least_distance : float
+        Least distance (s) of two samples of an output.
     """
 
     spans: Mapping[str, float]
     period: float
     duration: float
+    least_distance: float
 
 
 class FilterReadings(NamedTuple):
@@ -107,8 +132,8 @@ class FilterReadings(NamedTuple):
     places : tuple of (str, NoisePlace)
         The noise among them: its state, and where it acts.
     outputs : tuple of Output
-        n states; n² covariances, by rows; n² slopes ∂f/∂x, by rows; then for each output of the
-        model its n slopes ∂h/∂x.
+        n states; n² covariances, by rows; n² slopes ∂f/∂x, by rows, in a recursion those of the
+        step that ends there; then for each output of the model its n slopes ∂h/∂x.
     """
 
     states: tuple[str, ...]
@@ -118,22 +143,49 @@ class FilterReadings(NamedTuple):
 
 def list_filter_readings(model: Model) -> FilterReadings:
     """List what a smoother reads of a model with a filter."""
-    equations = {one.name: tree for one, tree in zip(model.states, model.equations, strict=True)}
-    noisy = [name for name in equations if _name_covariance((name, name)) in equations]
+    noisy = list_noisy(_name_states(model))
+    covariance = StateCovariance(noisy)
     places = [
         (name, NoisePlace(name[2:-1] if _is_load(name) else name, kind))
         for name in noisy
         for kind in [_find_kind(name, model)]
         if kind is not None
     ]
+    slopes = _follow_filter(model, noisy)
     trees: list[Expression] = [PastValue(name, "state") for name in noisy]
-    for a, b in product(noisy, noisy):
-        first, second = (a, b) if noisy.index(a) <= noisy.index(b) else (b, a)
-        trees.append(PastValue(_name_covariance((first, second)), "state"))
-    trees += [differentiate(equations[a], b) for a, b in product(noisy, noisy)]
-    trees += [differentiate(one.expression, a) for one, a in product(model.outputs, noisy)]
+    trees += [covariance.read(pair) for pair in product(noisy, noisy)]
+    trees += [slopes.get(pair, ZERO) for pair in product(noisy, noisy)]
+    trees += [
+        differentiate(one.expression, PastValue(name, "state"))
+        for one, name in product(model.outputs, noisy)
+    ]
     outputs = tuple(Output(f"filter {i}", tree) for i, tree in enumerate(trees))
     return FilterReadings(tuple(noisy), tuple(places), outputs)
+
+
+def _follow_filter(model: Model, noisy: Sequence[str]) -> Slopes:
+    """Differentiate the equations of a filter's states, those of its covariance left out.
+
+    In the first samples of a recursion, measured states do not follow those before.
+    """
+    rows = [i for i, name in enumerate(_name_states(model)) if not is_covariance(name)]
+    plain = replace(
+        model,
+        states=tuple(model.states[i] for i in rows),
+        equations=tuple(model.equations[i] for i in rows),
+        order=tuple(i for i in model.order if i in rows),
+    )
+    if not _is_recursion(model):
+        return follow_rates(plain).states
+    measured = {
+        state
+        for state, start in zip(_name_states(model), model.initial, strict=True)
+        if isinstance(start, MeasuredInitial)
+    }
+    return {
+        pair: hold_first_samples(model, ZERO, slope) if pair[0] in measured else slope
+        for pair, slope in follow_recursion(plain).states.items()
+    }
 
 
 def _find_kind(state: str, model: Model) -> Literal["load", "plant"] | None:
@@ -172,7 +224,7 @@ def list_noise_parameters(model: Model, noise: NoiseModel) -> tuple[Parameter, .
     """
     if noise not in FILTERED:
         return ()
-    filtered = add_kalman_filter(model, noise, NoiseScales({}, 1.0, 1.0))
+    filtered = add_kalman_filter(model, noise, NoiseScales({}, 1.0, 1.0, 1.0), {})
     added = filter(lambda one: is_noise_parameter(one.name), filtered.parameters)
     return tuple(replace(one, lower=_ANY_LOWER, upper=_ANY_UPPER) for one in added)
 
@@ -191,25 +243,27 @@ def list_plant_noise(model: Model) -> tuple[PlantNoise, ...]:
     return (*found, "drift") if found else ()
 
 
-def add_kalman_filter(model: Model, noise: PlantNoise, scales: NoiseScales) -> Model:
+def add_kalman_filter(
+    model: Model, noise: PlantNoise, scales: NoiseScales, changes: ParameterChanges
+) -> Model:
     """Add a Kalman filter to a model, with the parameters of its noise.
+
+    `changes` of the model's own parameters say how far lags of states reach.
 
     ``load`` adds loads: where the document names them, else at the first of those inputs that enter
     the same equations, whose loads nothing can tell apart. The parameters are ``load[u]``, its
     deviation over the sensor's, and ``tau[u]``, its correlation time (s). ``drift`` adds them at
-    the outputs, as the drift of their sensors. ``plant`` lets states
-    diffuse, with the parameter ``noise[x]``, per √s and over the sensor's deviation. These are
-    the states that the document names, and its loads are added. Without them, they are all states
-    that are not just the integral of another one.
+    the outputs, as the drift of their sensors. ``plant`` lets states diffuse, with the parameter
+    ``noise[x]``, over the sensor's deviation: per √s, in a recursion per sample. These are the
+    states that the document names, and its loads are added. Without them, they are all states that
+    are not just the integral of another one, or its last sample.
 
     Raises
     ------
     InvalidSettings
         If the model has no place for such noise, or no filter.
     """
-    if model.form != "differential":
-        raise _refuse(noise, f"model {model.name!r} is not of the differential form")
-    diffusion: dict[str, Expression] = {}
+    given, diffusion = model, dict[str, Expression]()
     if noise == "plant":
         model, diffusion = _add_diffusion(model, scales)
     if noise != "plant" or model.noise.load:
@@ -219,9 +273,41 @@ def add_kalman_filter(model: Model, noise: PlantNoise, scales: NoiseScales) -> M
     if not diffusion:
         raise _refuse(noise, "no input enters an equation, so there is no place for a load")
     try:
-        return _add_covariance(model, diffusion)
+        if _is_recursion(model):
+            intervals = _bound_parameters(given, changes)
+            return _add_recursive_covariance(given, model, diffusion, scales, intervals)
+        tangent = follow_rates(model)
+        covariance = StateCovariance(tangent.find_noisy(_name_states(model), diffusion))
+        rates = {pair: make_rate(pair, tangent, covariance, diffusion) for pair in covariance.pairs}
+        return _add_covariance(model, covariance, rates, rates, {})
     except NoDerivativeError as error:
         raise _refuse(noise, f"the filter cannot follow the function {error}") from None
+
+
+def match_measured_state(output: Output) -> str | None:
+    """Return the state that an output measures by itself, with drift or without; None of others."""
+    match output.expression:
+        case Binary("+", left, PastValue(name)) if _is_load(name):
+            return match_plain_state(left)
+        case tree:
+            return match_plain_state(tree)
+
+
+def _is_recursion(model: Model) -> bool:
+    return model.form != "differential"
+
+
+def _bound_parameters(model: Model, changes: ParameterChanges) -> dict[str, tuple[float, float]]:
+    """Bound the changed parameters; one that is tied may have any value."""
+    own = {one.name: changes[one.name] for one in model.parameters if one.name in changes}
+    return {
+        one.name: get_interval(one) if one.tied is None else (-inf, inf)
+        for one in override_parameters(model.parameters, own)
+    }
+
+
+def _name_states(model: Model) -> list[str]:
+    return [state.name for state in model.states]
 
 
 def _refuse(noise: PlantNoise, reason: str) -> InvalidSettings:
@@ -237,20 +323,20 @@ def _add_loads(
         load, deviation, time = f"d[{signal.name}]", f"load[{signal.name}]", f"tau[{signal.name}]"
         size, constant = Symbol(deviation, "parameter"), Symbol(time, "parameter")
         state = PastValue(load, "state")
-        equations = tuple(_add_to_input(tree, signal.name, state) for tree in model.equations)
+        before = replace(state, offset=1) if _is_recursion(model) else state
+        equations = tuple(_add_to_input(tree, signal.name, before) for tree in model.equations)
         outputs = tuple(
             replace(one, expression=Binary("+", one.expression, state))
             if one.name == signal.name
             else replace(one, expression=_add_to_input(one.expression, signal.name, state))
             for one in model.outputs
         )
-        decay = Unary("-", Binary("/", state, constant))
         ratio = _divide_spans(scales, signal.name, model)
         shortest = min(scales.period, 0.1 * scales.duration)
         model = replace(
             model,
             states=(*model.states, ModelSignal(load, signal.unit)),
-            equations=(*equations, decay),
+            equations=(*equations, _decay(before, constant, model)),
             outputs=outputs,
             initial=(*model.initial, FixedInitial(0.0)),
             order=(*model.order, len(model.order)),
@@ -266,9 +352,29 @@ def _add_loads(
                 Parameter(time, shortest, _LONGEST * scales.duration, "s", "log"),
             ),
         )
-        power = Binary("*", Number(2.0), Binary("*", size, size))
-        diffusion[load] = Binary("/", power, constant)
+        diffusion[load] = _excite(size, constant, model)
     return model, diffusion
+
+
+def _decay(load: Expression, time: Expression, model: Model) -> Expression:
+    """Make the rate of a load, or its next sample."""
+    if not _is_recursion(model):
+        return Unary("-", Binary("/", load, time))
+    return Binary("*", _keep(1.0, time), load)
+
+
+def _excite(size: Expression, time: Expression, model: Model) -> Expression:
+    """Make the squared diffusion of a load, or the variance that a sample adds."""
+    square = Binary("*", size, size)
+    if not _is_recursion(model):
+        return Binary("/", Binary("*", Number(2.0), square), time)
+    return Binary("*", square, Binary("-", ONE, _keep(2.0, time)))
+
+
+def _keep(steps: float, time: Expression) -> Expression:
+    """Make the share of a load that is left after some samples."""
+    share = Binary("/", Binary("*", Number(-steps), Symbol("h", "period")), time)
+    return FunctionCall("exp", (share,))
 
 
 def _list_loaded(model: Model) -> list[ModelSignal | Output]:
@@ -324,79 +430,100 @@ def _add_to_input(tree: Expression, name: str, load: Expression) -> Expression:
 
 
 def _add_diffusion(model: Model, scales: NoiseScales) -> tuple[Model, dict[str, Expression]]:
+    is_recursion = _is_recursion(model)
     root = sqrt(scales.duration)
+    lower, upper, per = _LEAST_SHARE / root, _MOST_SHARE / root, "/√s"
+    if is_recursion:
+        steps = model.solver.substeps * max(scales.duration / scales.period, 1.0)
+        lower, upper, per = _LEAST_SHARE / steps**_GROWTH, _MOST_SHARE, ""
     diffusion: dict[str, Expression] = {}
     parameters = list(model.parameters)
     for state, equation in zip(model.states, model.equations, strict=True):
-        is_position = match_plain_state(equation) is not None  # its rate alone is disturbed
-        if state.name not in model.noise.plant if model.noise.plant else is_position:
+        is_copy = isinstance(equation, PastValue) and equation.kind == "state"
+        if state.name not in model.noise.plant if model.noise.plant else is_copy:
             continue
         name = f"noise[{state.name}]"
         unit = _divide_by_sensor(state.unit, model)
-        lower, upper = _LEAST_SHARE / root, _MOST_SHARE / root
-        parameters.append(Parameter(name, lower, upper, f"{unit}/√s", "log"))
+        parameters.append(Parameter(name, lower, upper, f"{unit}{per}", "log"))
         size = Symbol(name, "parameter")
         diffusion[state.name] = Binary("*", size, size)
     return replace(model, parameters=tuple(parameters)), diffusion
 
 
-def _add_covariance(model: Model, diffusion: Mapping[str, Expression]) -> Model:
-    """Add the covariance of all states that noise reaches, and the corrections by samples."""
-    names = [state.name for state in model.states]
-    slopes = {
-        (name, other): slope
-        for name, equation in zip(names, model.equations, strict=True)
-        for other in names
-        if (slope := differentiate(equation, other)) != ZERO
+def _add_recursive_covariance(
+    given: Model,
+    model: Model,
+    diffusion: Mapping[str, Expression],
+    scales: NoiseScales,
+    intervals: Mapping[str, tuple[float, float]],
+) -> Model:
+    """Add the covariance of a recursion, whose first samples are the start of the given model.
+
+    There its states keep their values. Of a state that starts at measured values each of them is
+    unknown, until the sample corrects it.
+    """
+    step = scales.least_distance / model.solver.substeps
+    model = add_lagged_states(model, intervals, step)
+    unknown = {
+        state: _measure_unknown(state, model, scales)
+        for state, start in zip(_name_states(given), given.initial, strict=True)
+        if isinstance(start, MeasuredInitial)
     }
-    noisy = _find_noisy(names, slopes, diffusion)
-    pairs = [(a, b) for i, a in enumerate(noisy) for b in noisy[i:]]
-    covariance = {frozenset(pair): PastValue(_name_covariance(pair), "state") for pair in pairs}
-    changes = [_make_rate(pair, noisy, slopes, covariance, diffusion) for pair in pairs]
+    tangent = follow_recursion(model)
+    covariance = StateCovariance(tangent.find_noisy(_name_states(model), {**diffusion, **unknown}))
+    own = set(_name_states(given))
+    kept = {(name, name): ONE for name in own if name not in unknown}
+    held = Tangent(
+        {pair: slope for pair, slope in tangent.states.items() if pair[0] not in own} | kept,
+        {pair: slope for pair, slope in tangent.noises.items() if pair[0] == pair[1]},
+    )
+    first = {name: one for name, one in diffusion.items() if name not in own} | unknown
+    steps = {pair: make_step(pair, tangent, covariance, diffusion) for pair in covariance.pairs}
+    changes = {
+        pair: hold_first_samples(model, make_step(pair, held, covariance, first), step)
+        for pair, step in steps.items()
+    }
+    equations = (
+        hold_first_samples(model, PastValue(name, "state", 1), tree) if name in own else tree
+        for name, tree in zip(_name_states(model), model.equations, strict=True)
+    )
+    model = replace(model, equations=tuple(equations))
+    return _add_covariance(model, covariance, changes, steps, unknown)
+
+
+def _measure_unknown(state: str, model: Model, scales: NoiseScales) -> Expression:
+    """Measure a variance that is large beside the sensor's, of which a single one is 1."""
+    output = next(one for one in model.outputs if match_measured_state(one) == state)
+    deviation = scales.spans.get(output.name, 0.0) / _SPAN if len(model.outputs) > 1 else 1.0
+    return Number(_UNKNOWN * deviation**2)
+
+
+def _add_covariance(
+    model: Model,
+    covariance: StateCovariance,
+    changes: Mapping[Pair, Expression],
+    steady: Mapping[Pair, Expression],
+    unknown: Mapping[str, Expression],
+) -> Model:
+    """Add the covariance of all states that noise reaches, and the corrections by samples.
+
+    `steady` are its changes at rest, `unknown` the variances of states that start unknown.
+    """
     resting = _list_resting(model)
-    rates = {p: rate for p, rate in zip(pairs, changes, strict=True) if resting.issuperset(p)}
-    state_of = {pair: covariance[frozenset(pair)].name for pair in pairs}
+    rates = {pair: steady[pair] for pair in steady if resting.issuperset(pair)}
+    state_of = {pair: covariance.name(pair) for pair in changes}
     solved = _solve_stationary(rates, state_of, model)
-    starts = [_make_start(pair, solved.get(state_of[pair])) for pair in pairs]
+    solved |= {covariance.name((name, name)): one for name, one in unknown.items()}
+    starts = [_make_start(pair, solved.get(state_of[pair])) for pair in changes]
+    names = len(model.states)
     return replace(
         model,
-        states=(*model.states, *(ModelSignal(covariance[frozenset(p)].name) for p in pairs)),
-        equations=(*model.equations, *changes),
+        states=(*model.states, *map(ModelSignal, state_of.values())),
+        equations=(*model.equations, *changes.values()),
         initial=(*model.initial, *starts),
-        order=(*model.order, *range(len(names), len(names) + len(pairs))),
-        corrections=tuple(_make_corrections(model, noisy, pairs, covariance)),
+        order=(*model.order, *range(names, names + len(changes))),
+        corrections=tuple(_make_corrections(model, covariance)),
     )
-
-
-def _find_noisy(
-    names: Sequence[str], slopes: _Slopes, diffusion: Mapping[str, Expression]
-) -> list[str]:
-    """Find the states that noise reaches, in the model's order."""
-    noisy = set(diffusion)
-    while reached := {a for a, b in slopes if b in noisy} - noisy:
-        noisy |= reached
-    return [name for name in names if name in noisy]
-
-
-def _make_rate(
-    pair: tuple[str, str],
-    noisy: Sequence[str],
-    slopes: _Slopes,
-    covariance: _Covariance,
-    diffusion: Mapping[str, Expression],
-) -> Expression:
-    """Make the rate of a covariance: an entry of A P + P Aᵀ + Q."""
-    first, second = pair
-    sides: list[Expression] = []
-    for one, other in ((first, second), (second, first)):
-        total: Expression = ZERO
-        for name in noisy:
-            slope = slopes.get((one, name), ZERO)
-            total = add(total, multiply(slope, covariance[frozenset((name, other))]))
-        sides.append(total)
-    if first == second:
-        return add(multiply(Number(2.0), sides[0]), diffusion.get(first, ZERO))
-    return add(*sides)
 
 
 def _list_resting(model: Model) -> set[str]:
@@ -409,7 +536,7 @@ def _list_resting(model: Model) -> set[str]:
 
 
 def _solve_stationary(
-    pairs: Mapping[_Pair, Expression], names: Mapping[_Pair, str], model: Model
+    pairs: Mapping[Pair, Expression], names: Mapping[Pair, str], model: Model
 ) -> dict[str, Expression]:
     """Solve A P + P Aᵀ + Q = 0 for some covariances by their rates; the others are 0.
 
@@ -421,17 +548,21 @@ def _solve_stationary(
         if isinstance(start, FixedInitial):
             known[state.name] = Number(start.value)
         elif isinstance(start, DerivedInitial):
-            known[state.name] = start.expression
+            known[state.name] = substitute(start.expression, _find_start(known))
     intervals = {parameter.name: get_interval(parameter) for parameter in model.parameters}
     rates = {names[pair]: rate for pair, rate in pairs.items()}
     try:
-        return solve_rest(rates, known, intervals, is_rate=True)
+        return solve_rest(rates, known, intervals, is_rate=not _is_recursion(model))
     except NoRestError:
         loads = {pair: rate for pair, rate in pairs.items() if all(map(_is_load, pair))}
         return _solve_stationary(loads, names, model) if len(loads) < len(pairs) else {}
 
 
-def _make_start(pair: _Pair, solved: Expression | None) -> FixedInitial | DerivedInitial:
+def _find_start(known: Mapping[str, Expression]) -> Callable[[Expression], Expression | None]:
+    return lambda node: known.get(node.name) if isinstance(node, PastValue) else None
+
+
+def _make_start(pair: Pair, solved: Expression | None) -> FixedInitial | DerivedInitial:
     """Make the start of a covariance; a variance is not negative, even of an unstable plant."""
     if solved is None:
         return FixedInitial(0.0)
@@ -440,31 +571,25 @@ def _make_start(pair: _Pair, solved: Expression | None) -> FixedInitial | Derive
     return DerivedInitial(solved, "stationary")
 
 
-def _name_covariance(pair: _Pair) -> str:
-    return f"P[{','.join(pair)}]"
-
-
 def _is_load(state: str) -> bool:
     return state.startswith("d[")
 
 
-def _make_corrections(
-    model: Model,
-    noisy: Sequence[str],
-    pairs: Sequence[tuple[str, str]],
-    covariance: _Covariance,
-) -> Iterator[Correction]:
+def _make_corrections(model: Model, covariance: StateCovariance) -> Iterator[Correction]:
     for output in model.outputs:
-        seen = {name: differentiate(output.expression, name) for name in noisy}
+        seen = {
+            name: differentiate(output.expression, PastValue(name, "state"))
+            for name in covariance.noisy
+        }
         shared: dict[str, Expression] = {}
         variance: Expression = ZERO
-        for name in noisy:
+        for name in covariance.noisy:
             total: Expression = ZERO
-            for other in noisy:
-                total = add(total, multiply(covariance[frozenset((name, other))], seen[other]))
+            for other in covariance.noisy:
+                total = add(total, multiply(covariance.read((name, other)), seen[other]))
             shared[name] = total
             variance = add(variance, multiply(seen[name], total))
         losses = (
-            (covariance[frozenset((a, b))].name, multiply(shared[a], shared[b])) for a, b in pairs
+            (covariance.name((a, b)), multiply(shared[a], shared[b])) for a, b in covariance.pairs
         )
         yield Correction(output.name, variance, tuple(shared.items()), tuple(losses))

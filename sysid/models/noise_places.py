@@ -1,7 +1,8 @@
 """Places of noise in a document: ``noise: {plant: {x: estimate}, load: {u: estimate}}``.
 
-Noise in the plant diffuses a state. A load is a slow disturbance at an input, or the drift of an
-output's sensor. Their sizes are always estimated, so `estimate` is the one value.
+Noise in the plant diffuses a state, or is added to each sample of a recursion. A load is a slow
+disturbance at an input, or the drift of an output's sensor. Their sizes are always estimated, so
+`estimate` is the one value.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +25,7 @@ def read_noise(
     inputs: Sequence[str],
     outputs: Sequence[Output],
 ) -> NoisePlaces:
-    """Read the places of noise; `equations` by state are those of the differential form."""
+    """Read the places of noise; `equations` are given by state."""
     fields = reader.read_section(value, "/noise", _SECTIONS)
     names = [output.name for output in outputs]
     plant = _read_names(reader, fields.get("plant"), "plant", list(equations), "state")

@@ -229,10 +229,6 @@ def _read_noise(
 ) -> NoisePlaces:
     if value is None:
         return NoisePlaces()
-    if scope.form != "differential":
-        detail = "belongs to the differential form; a recursion predicts from measured values"
-        reader.add_fault("/noise", detail)
-        return NoisePlaces()
     if len(trees) < len(scope.states):  # the faults of the equations are told first
         return NoisePlaces()
     equations_of = dict(zip(scope.states, trees, strict=True))
@@ -365,7 +361,8 @@ def _read_polynomial_model(reader: DocumentReader, fields: Mapping[str, Any]) ->
     initial = read_initial_states(reader, fields.get("initial"), scope, MeasuredInitial())
     initial = derive_starts(reader, {output.name: initial[0]}, ())
     solver = read_solver(reader, fields.get("solver"), "polynomial")
-    _read_noise(reader, fields.get("noise"), scope, (), ())
+    measured = (Output(output.name, PastValue(output.name, "state"), output.unit),)
+    noise = _read_noise(reader, fields.get("noise"), scope, (equation.tree,), measured)
     reader.raise_faults()
     named = {parameter.name: get_interval(parameter) for parameter in equation.coefficients}
     whole = replace(scope, parameters={**named, **scope.parameters})
@@ -376,7 +373,7 @@ def _read_polynomial_model(reader: DocumentReader, fields: Mapping[str, Any]) ->
         form="polynomial",
         inputs=inputs,
         states=(output,),
-        outputs=(Output(output.name, PastValue(output.name, "state"), output.unit),),
+        outputs=measured,
         parameters=(*equation.coefficients, *parameters),
         equations=(equation.tree,),
         initial=initial,
@@ -386,6 +383,7 @@ def _read_polynomial_model(reader: DocumentReader, fields: Mapping[str, Any]) ->
         document={},
         terms=equation.terms,
         rule=equation.rule,
+        noise=noise,
     )
 
 

@@ -148,6 +148,8 @@ class Result:
         Tests of the residuals.
     onset_delays : tuple of OnsetDelay
         Delay between the start of an input's and an output's change.
+    time_unit : str
+        Unit in which the record had its times, such as ``min``. Estimates are in their own unit.
     data_bounds : tuple of str
         Parameters whose bounds follow the data, unless given.
     input_hold : tuple of InputHold
@@ -203,6 +205,7 @@ class Result:
     noise_deviations: tuple[tuple[float, ...], ...] | None
     residual_tests: ResidualTests
     onset_delays: tuple[OnsetDelay, ...]
+    time_unit: str
     data_bounds: tuple[str, ...]
     input_hold: tuple[InputHold, ...]
     commands: tuple[str, ...]

@@ -16,6 +16,7 @@ from sysid.core.text import (
     plain_unit,
     split_estimate,
 )
+from sysid.core.units import find_conversion_factor
 from sysid.core.value_documents import list_fields
 from sysid.results.findings import list_untold_reasons
 from sysid.results.parts import OrderComparison, PlantNoise, SearchEvidence
@@ -101,7 +102,9 @@ def _list_columns(estimate: Estimate) -> Iterator[tuple[str, object]]:
 
 def list_evidence(result: Result) -> list[str]:
     """List the evidence beside the findings: residual tests, noise, the order if none tells it."""
-    evidence = [describe_residuals(result)] if result.residual_tests.passed is not None else []
+    evidence = [describe_times(result)] if result.time_unit != "s" else []
+    if result.residual_tests.passed is not None:
+        evidence.append(describe_residuals(result))
     if result.plant_noise is not None:
         evidence.append(describe_noise(result.plant_noise))
         evidence += describe_predictions(result.plant_noise, find_output_unit(result))
@@ -109,7 +112,20 @@ def list_evidence(result: Result) -> list[str]:
         one.severity != "note" or one.explanation == "order" for one in result.findings
     ):
         evidence.append(describe_order(result.order_comparison))
-    return evidence
+    return [line for line in evidence if line]
+
+
+def describe_times(result: Result) -> str:
+    """Give the estimates in seconds in the unit of the record's times; empty if there are none."""
+    size = find_conversion_factor(result.time_unit, "s")
+    if size is None:
+        return ""
+    shown = []
+    for one in result.parameters:
+        if one.unit == "s":
+            error = None if one.stderr is None else one.stderr / size
+            shown.append(f"{one.name} {plain_estimate(one.value / size, error, status=one.status)}")
+    return f"in {result.time_unit}: {', '.join(shown)}" if shown else ""
 
 
 def describe_residuals(result: Result) -> str:

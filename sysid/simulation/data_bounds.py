@@ -133,7 +133,9 @@ def measure_noise_scales(records: Sequence[Record]) -> NoiseScales:
     spans = {name: float(np.ptp(one)) for name, one in values.items() if one.size}
     outputs = [channel for record in records for channel in record.outputs]
     period = min(_find_period(_drop_missing(channel)) for channel in outputs)
-    return NoiseScales(spans, period, min(record.stop - record.start for record in records))
+    duration = min(record.stop - record.start for record in records)
+    distances = [step for one in outputs for step in np.diff(one.times).tolist() if step > 0]
+    return NoiseScales(spans, period, duration, min(distances, default=period))
 
 
 def _choose_interval(rule: BoundsRule, spans: _Spans, has_offset: bool) -> Interval:

@@ -13,7 +13,8 @@ from sysid.core.types import BoolArray, FloatArray
 from sysid.data.interpolation import FineInput
 from sysid.data.records import Channel, Record
 from sysid.kernels.signals.past_reads import is_difference, list_delaying_inputs
-from sysid.language.tree import PastValue, match_plain_state
+from sysid.language.tree import PastValue
+from sysid.models.kalman_filter import match_measured_state
 from sysid.models.model import (
     DerivedInitial,
     EstimatedInitial,
@@ -292,7 +293,7 @@ def _find_scoring_starts(model: Model, grid: Grid, scored_from: float) -> dict[s
     computed = grid.start + (max(model.memory, 1) - 0.5) * grid.integration_step
     return {
         output.name: max(scored_from, computed)
-        if isinstance(initial.get(match_plain_state(output.expression) or ""), MeasuredInitial)
+        if isinstance(initial.get(match_measured_state(output) or ""), MeasuredInitial)
         else scored_from
         for output in model.outputs
     }
@@ -391,9 +392,7 @@ def _read_measured_start(
     InvalidRecord
         If no output measures the state or its integral.
     """
-    measured = {
-        match_plain_state(o.expression): c for o, c in zip(model.outputs, outputs, strict=True)
-    }
+    measured = {match_measured_state(o): c for o, c in zip(model.outputs, outputs, strict=True)}
     name = model.states[state].name
     count = max(model.memory, 1) if is_difference(model) else 1
     if name in measured:

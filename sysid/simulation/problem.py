@@ -178,7 +178,8 @@ class Problem:
         noise = settings.loss.noise_model
         check_noise_changes(settings.parameters, noise)
         if noise == "plant" or noise == "load" or noise == "drift":
-            model = add_kalman_filter(model, noise, measure_noise_scales(records))
+            scales = measure_noise_scales(records)
+            model = add_kalman_filter(model, noise, scales, settings.parameters)
         declared = (*model.parameters, *build_initial_parameters(model, len(records)))
         bounded = bound_by_data(add_units_of_data(declared, records), records)
         all_parameters = override_parameters(bounded, settings.parameters)

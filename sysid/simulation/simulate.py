@@ -140,8 +140,8 @@ def prepare_simulation(
     measured = _find_measured(inputs, values)
     if not isinstance(values, Mapping):
         model, signals, values = _restore(model, signals, values)
-    _check_values(model, values)
-    at, start = _choose_times(signals, times)
+    check_values(model, values)
+    at, start, _ = _choose_times(signals, times)
     outputs = tuple(
         Channel(
             output.name,
@@ -235,7 +235,7 @@ def _choose_times(inputs: tuple[Channel, ...], times: ArrayLike | None) -> TimeA
     if times is None:
         axis = TimeAxis(inputs[0].times, start)
     else:
-        at, first = read_times(times, "the times")
+        at, first, _ = read_times(times, "the times")
         if first is not None and start is not None:
             at = at + measure_distance(first, start)
         axis = TimeAxis(at, start if inputs else first)
@@ -257,7 +257,14 @@ def complete_values(model: Model, values: Mapping[str, float]) -> dict[str, floa
     return {**ties, **available}
 
 
-def _check_values(model: Model, values: Mapping[str, float]) -> None:
+def check_values(model: Model, values: Mapping[str, float]) -> None:
+    """Check that all free parameters have values, and that names and numbers are right.
+
+    Raises
+    ------
+    InvalidSettings
+        With the pointer of the first one that is not.
+    """
     names = [parameter.name for parameter in model.parameters]
     free = [parameter.name for parameter in model.parameters if parameter.is_free]
     starts = [name_initial_state(state.name, 0) for state in model.states]

@@ -24,25 +24,26 @@ def list_starts(problem: Problem, theta: FloatArray) -> dict[str, float]:
     model, starts = problem.model, dict[str, float]()
     inputs = [signal.name for signal in model.inputs]
     for e, experiment in enumerate(problem.experiments):
-        first_inputs = dict(zip(inputs, experiment.first_inputs, strict=True))
+        first_values = dict(zip(inputs, experiment.first_inputs, strict=True))
         for i, (state, start) in enumerate(zip(model.states, model.initial, strict=True)):
             name = name_initial_state(state.name, e)
             if isinstance(start, EstimatedInitial):
                 starts[name] = values[name]
             elif isinstance(start, DerivedInitial):
-                tree = _insert_inputs(start.expression, first_inputs)
+                tree = _insert_values(start.expression, first_values)
                 known = {**values, "h": experiment.grid.integration_step}
                 starts[name] = evaluate_expression(tree, known)
             else:
                 starts[name] = float(experiment.starts[i].first_values[0])
+            first_values[state.name] = starts[name]  # a lagged state starts there too
     return starts
 
 
-def _insert_inputs(tree: Expression, first_inputs: Mapping[str, float]) -> Expression:
-    def find_input(node: Expression) -> Expression | None:
-        return Number(first_inputs[node.name]) if isinstance(node, PastValue) else None
+def _insert_values(tree: Expression, first_values: Mapping[str, float]) -> Expression:
+    def find_value(node: Expression) -> Expression | None:
+        return Number(first_values[node.name]) if isinstance(node, PastValue) else None
 
-    return substitute(tree, find_input)
+    return substitute(tree, find_value)
 
 
 def convert_point(

@@ -6,6 +6,9 @@ reaches the bound moves the response by σ√(r/n) in RMS, where r is the number
 directions. Both grow in proportion to σ, so they are computed for σ = 1. If σ is large, limits on
 the parameters can keep estimates below the bound, which ignores such limits.
 
+Noise inside a recursion, φ of Eq. 16, is the error of predictions one step ahead if its state is
+measured without noise. Then S is their sensitivity, and the bound is the same.
+
 The bound applies to the noise that a job adds. `sysid.data.noise` draws it independently for each
 output. A measured record may have noise of its own, also correlated between outputs
 (`sysid.residuals.sandwich`). That noise is in the standard errors, not in the bound.
@@ -21,6 +24,9 @@ from sysid.core.types import FloatArray
 from sysid.identifiability.combinations import NULL_SHARE
 from sysid.identifiability.scaling_symmetries import find_scalings
 from sysid.identifiability.translations import find_translations
+from sysid.kernels.signals.past_reads import is_difference
+from sysid.language.tree import match_plain_state
+from sysid.models.model import Model
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import compute_physical_scale, remove_symmetries
 from sysid.uncertainty.sensitivities import compute_sensitivities
@@ -47,6 +53,13 @@ class CramerRaoBound:
     stderr: FloatArray
     response_rms: float
     samples: int
+
+
+def measures_its_recursion(model: Model) -> bool:
+    """Whether a model is a recursion of one state, and an output measures it."""
+    names = [state.name for state in model.states]
+    measured = [match_plain_state(output.expression) for output in model.outputs]
+    return is_difference(model) and measured == names and len(names) == 1
 
 
 def cramer_rao_bound(problem: Problem, theta: FloatArray) -> CramerRaoBound:

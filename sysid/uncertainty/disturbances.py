@@ -6,7 +6,7 @@ from the whole record. The fixed-interval smoother (Rauch, Tung and Striebel, AI
 Time Series Analysis by State Space Methods, 2nd ed., ch. 4.4 and 6.4)::
 
     r ← c v/S + (I - K cᵀ)ᵀ r,   N ← c cᵀ/S + (I - K cᵀ)ᵀ N (I - K cᵀ)      over a sample
-    r ← Φᵀ r,  N ← Φᵀ N Φ,  Φ = exp(A h)                                    over a step
+    r ← Φᵀ r,  N ← Φᵀ N Φ,  Φ = exp(A h), in a recursion its tangent        over a step
     x̂ = x + P r,  V = P - P N P
 
 x, P, A and c are those of the filter, read before the samples of a time, v an innovation and S its
@@ -26,8 +26,11 @@ from scipy.linalg import expm
 from sysid.core.distributions import student_limit
 from sysid.core.types import FloatArray
 from sysid.kernels.borrowing import compile_borrowing
+from sysid.kernels.signals.past_reads import is_difference
 from sysid.models.kalman_filter import FilterReadings, list_filter_readings
+from sysid.models.model import Model
 from sysid.simulation.data_bounds import list_units
+from sysid.simulation.grid import Grid
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.output_bands import ParameterSpread
 
@@ -174,7 +177,7 @@ def _read_filter(problem: Problem, readings: FilterReadings, points: FloatArray)
             _Readings(
                 states,
                 covariances.reshape(shape),
-                _make_transitions(slopes.reshape(shape), experiment.grid.step),
+                _make_transitions(slopes.reshape(shape), experiment.grid, problem.model),
                 rows.reshape(len(points), count, m, n),
                 innovations,
                 precisions,
@@ -183,11 +186,16 @@ def _read_filter(problem: Problem, readings: FilterReadings, points: FloatArray)
     return found
 
 
-def _make_transitions(slopes: FloatArray, step: float) -> FloatArray:
-    """Make Φ over each step from the slopes at its ends; one for all steps of a linear model."""
+def _make_transitions(slopes: FloatArray, grid: Grid, model: Model) -> FloatArray:
+    """Make Φ over each step from the slopes at its ends; one for all steps of a linear model.
+
+    Those of a recursion are of the last one of its steps between two grid points.
+    """
+    if is_difference(model):
+        return np.asarray(np.linalg.matrix_power(slopes[:, 1:], grid.substeps))
     if np.array_equal(slopes[:, 1:], slopes[:, :-1]):
-        return np.asarray(expm(step * slopes[:, :1]))
-    return np.asarray(expm(0.5 * step * (slopes[:, :-1] + slopes[:, 1:])))
+        return np.asarray(expm(grid.step * slopes[:, :1]))
+    return np.asarray(expm(0.5 * grid.step * (slopes[:, :-1] + slopes[:, 1:])))
 
 
 def _smooth(filtered: _Readings) -> tuple[FloatArray, FloatArray]:

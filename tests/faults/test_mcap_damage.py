@@ -21,7 +21,7 @@ from mcap.records import Chunk, DataEnd, Footer, Header, McapRecord, Message, Me
 from mcap.writer import CompressionType
 
 from service.formats.limits import DEFAULT_LIMITS, UploadLimits
-from service.formats.mcap.mcap_files import read_mcap_with_notes
+from service.formats.mcap.mcap_files import read_mcap, read_mcap_with_notes
 from service.formats.mcap.mcap_messages import build_schema
 from service.formats.mcap.mcap_writer import MCAP_MAGIC
 from sysid.core.errors import UnreadableFile
@@ -105,9 +105,36 @@ def test_the_parts_used_here_make_a_file_that_is_read() -> None:
 def test_a_file_cut_off_anywhere_is_refused_at_a_byte_of_it(content: bytes) -> None:
     places = {*range(60), *range(0, len(content), 7), *range(len(content) - 60, len(content))}
     for length in sorted(places):
-        error = read_refusal(content[:length])
-        assert error.byte is not None
-        assert 0 <= error.byte <= length
+        with pytest.raises(UnreadableFile) as caught:
+            read_mcap(content[:length])
+        assert caught.value.byte is not None
+        assert 0 <= caught.value.byte <= length
+
+
+@pytest.mark.parametrize("content", FILES)
+def test_what_is_whole_in_a_file_that_is_cut_off_is_read_and_told(content: bytes) -> None:
+    whole = read_mcap(content)
+    lengths = []
+    for length in range(0, len(content) - len(MCAP_MAGIC), 5):
+        try:
+            recording, notes = read_mcap_with_notes(content[:length], DEFAULT_LIMITS)
+        except UnreadableFile:
+            continue  # before the first message
+        assert notes[-1].startswith("the file ends inside ")
+        assert f"What is whole was read, up to {recording.stop:.6g} s" in notes[-1]
+        for channel in recording.channels:
+            values = whole.channel(channel.name).values[: channel.values.size]
+            np.testing.assert_array_equal(channel.values, values)
+        lengths.append(length)
+    assert lengths
+
+
+def test_a_rest_of_zeros_was_never_written() -> None:
+    written = MCAP_MAGIC + join_records(Header("", "test"), CHANNEL, MESSAGE)
+    recording, notes = read_mcap_with_notes(written + bytes(4096), DEFAULT_LIMITS)
+    assert recording.channel("x").values.tolist() == [2.0]
+    assert notes[-1].startswith("the rest of the file has zeros alone; it was never written.")
+    assert "opcode 0" in read_refusal(written + bytes(4096) + b"x").detail
 
 
 def test_one_flipped_bit_anywhere_in_a_file_of_ours_is_found() -> None:

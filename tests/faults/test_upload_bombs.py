@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from service.formats.limits import DEFAULT_LIMITS, MIB
+from service.formats.read_options import ReadOptions
 from service.formats.recordings import read_with_notes
 from sysid.core.errors import UnreadableFile
 from tests.support.files.experiment_files import write_mat, write_parquet, write_sheet
@@ -23,7 +24,7 @@ def refuse(folder: Path, content: bytes, **limits: Any) -> str:
     path.write_bytes(content)
     assert len(content) < MIB
     with pytest.raises(UnreadableFile) as caught:
-        read_with_notes(path, limits=replace(DEFAULT_LIMITS, **limits))
+        read_with_notes(path, ReadOptions(limits=replace(DEFAULT_LIMITS, **limits)))
     assert "\n" not in caught.value.detail
     return caught.value.detail
 

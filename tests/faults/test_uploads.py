@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import typer
 
-from service.cli.identify_command import FileOptions, read_input_file
-from service.formats import limits as format_limits
+from service.cli.identify_command import read_input_file
 from service.formats import sandbox
 from service.formats.limits import DEFAULT_LIMITS, MIB
+from service.formats.read_options import ReadOptions
 from service.formats.sandbox import read_untrusted
 from sysid.core.child_processes import run_child
 from sysid.core.errors import UnreadableFile
@@ -32,14 +32,16 @@ def save_file(folder: Path, content: bytes) -> Path:
 
 def read_refusal(path: Path, **options: object) -> UnreadableFile:
     with pytest.raises(UnreadableFile) as caught:
-        read_untrusted(path, **options)  # type: ignore[arg-type]
+        read_untrusted(path, ReadOptions(**options))  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     return caught.value
 
 
 def test_a_csv_upload_is_read_with_its_notes_and_hash(tmp_path: Path) -> None:
     content = b"n,u [V]\n1,0.5\n1,\n2,0.25\n"
-    read = read_untrusted(save_file(tmp_path, content), sample_time=0.5, segments=("n",))
+    read = read_untrusted(
+        save_file(tmp_path, content), ReadOptions(sample_time=0.5, segments=("n",))
+    )
     np.testing.assert_array_equal(read.recording.channel("u").values, [0.5, np.nan, 0.25])
     assert [one.labels["n"] for one in read.recording.segments] == [1.0, 2.0]
     assert any("n divides the file" in note for note in read.notes)
@@ -59,7 +61,7 @@ def test_the_place_of_a_fault_comes_out_of_the_child(tmp_path: Path) -> None:
     error = read_refusal(save_file(tmp_path, b"t,u\n0,1\n1,x\n"))
     assert (error.row, error.column) == (3, "u")
     content = write_mcap_bytes(Recording((Channel("u", TIMES, TIMES),)))
-    assert read_refusal(save_file(tmp_path, content[:-100])).byte is not None
+    assert read_refusal(save_file(tmp_path, content[:60])).byte is not None
 
 
 def test_missing_values_are_said_and_infinite_ones_refused(tmp_path: Path) -> None:
@@ -115,30 +117,27 @@ def test_times_that_no_file_can_hold_are_refused(tmp_path: Path) -> None:
 
 
 def test_identify_reads_mcap_under_the_limits_of_the_service(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     times = np.arange(20_000) * 0.01
     path = tmp_path / "recording.mcap"
     path.write_bytes(write_mcap_bytes(Recording((Channel("u", times, np.sin(times)),))))
-    own = FileOptions(None, ())
-    np.testing.assert_array_equal(read_input_file(path, own).channel("u").values, np.sin(times))
+    recording = read_input_file(path, ReadOptions())
+    np.testing.assert_array_equal(recording.channel("u").values, np.sin(times))
     smaller = replace(DEFAULT_LIMITS, memory_bytes=64 * MIB)
-    monkeypatch.setattr(format_limits, "DEFAULT_LIMITS", smaller)
     with pytest.raises(typer.Exit):
-        read_input_file(path, own)
+        read_input_file(path, ReadOptions(limits=smaller))
     assert "64 MiB of memory" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("endless_children")
 def test_identify_reads_a_file_no_longer_than_the_service(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     short = replace(DEFAULT_LIMITS, seconds=0.01)
-    monkeypatch.setattr(format_limits, "DEFAULT_LIMITS", short)
+    path = save_file(tmp_path, b"t,u\n0,1\n").rename(tmp_path / "a.mcap")
     with pytest.raises(typer.Exit):
-        read_input_file(
-            save_file(tmp_path, b"t,u\n0,1\n").rename(tmp_path / "a.mcap"), FileOptions(None, ())
-        )
+        read_input_file(path, ReadOptions(limits=short))
     assert "takes more than 0.01 s" in capsys.readouterr().err
 
 

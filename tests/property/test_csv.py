@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from service.formats.read_options import ReadOptions
 from service.formats.tabular.csv_recordings import read_csv
 from sysid.core.errors import UnreadableFile
 from tests.support.profiles import scale_examples
@@ -18,7 +19,7 @@ def test_printed_numbers_come_back_bit_for_bit(
     values: list[float], separator: str, end: str
 ) -> None:
     rows = [f"t{separator}u", *(f"{k}{separator}{value!r}" for k, value in enumerate(values))]
-    recording, _ = read_csv((end.join(rows) + end).encode())
+    recording, _ = read_csv((end.join(rows) + end).encode(), ReadOptions(missing=("none",)))
     assert recording.channel("u").values.tobytes() == np.array(values).tobytes()
 
 
@@ -47,5 +48,5 @@ def test_any_bytes_are_read_or_refused(
     content: bytes, sample_time: float | None, segments: tuple[str, ...]
 ) -> None:
     with suppress(UnreadableFile):
-        recording, _ = read_csv(content, sample_time=sample_time, segments=segments)
+        recording, _ = read_csv(content, ReadOptions(sample_time=sample_time, segments=segments))
         assert recording.samples > 0

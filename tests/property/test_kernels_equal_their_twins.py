@@ -246,3 +246,40 @@ def test_a_kalman_filter_equals_its_twin(
     is_finite = np.isfinite(costs)  # Euler steps may lose the sign of a variance
     assert np.sum(is_finite) >= 2
     assert np.all(np.max(np.abs(found - white)[is_finite], axis=1) > 0.01)
+
+
+@pytest.mark.parametrize("noise", ["load", "plant", "drift"])
+@pytest.mark.parametrize(
+    ("interpolation", "substeps", "start"),
+    [
+        ("linear", 1, {"x": "measured", "w": 0.1}),
+        ("cubic", 1, {"x": {"lower": -1, "upper": 1}, "w": 0.1}),
+        ("nearest", 3, {"x": 0.2, "w": {"lower": -1, "upper": 1}}),
+    ],
+)
+def test_a_kalman_filter_of_a_recursion_equals_its_twin(
+    noise: Any, interpolation: str, substeps: int, start: dict[str, Any]
+) -> None:
+    solver = {"interpolation": interpolation, "substeps": substeps}
+    output = "x" if start["x"] == "measured" else "x + 0.1*w**2 + 0.1*x(k-2) + 0.1*x(k - L/h)"
+    model = difference(RECURSION, output, solver=solver, initial=start)
+    gaps = record(26)
+    values = gaps.outputs[0].values.copy()
+    values[[3, 4, 14]] = np.nan
+    records = [record(20), with_output(gaps, values)]
+    place = "y" if noise == "drift" else "u"
+    sizes = {f"load[{place}]": (0.1, 10), f"tau[{place}]": (0.1, 1)}
+    if noise == "plant":
+        sizes = {"noise[x]": (0.1, 3), "noise[w]": (0.1, 3)}
+    parameters = {n: {"lower": low, "upper": high} for n, (low, high) in sizes.items()}
+    loss = Loss(noise_model=noise)
+    problem = Problem.build(model, records, loss=loss, skip=2, parameters=parameters)
+    theta = individuals(problem, 4)
+    expected = np.array([plain_twins.predictions(problem, one) for one in theta])
+    found = problem.predict(theta)
+    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
+    costs = [plain_twins.fitness(problem, one) for one in theta]
+    np.testing.assert_allclose(problem.evaluate_fitness(theta), costs, rtol=1e-7)
+    kept = [i for i, name in enumerate(problem.free_names) if name not in parameters]
+    white = Problem.build(model, records, skip=2).predict(theta[:, kept])
+    assert np.all(np.max(np.abs(found - white), axis=1) > 0.001)

@@ -24,6 +24,7 @@ MODULES = {
     "pyyaml": "yaml",
     "markdown-it-py": "markdown_it",
     "protobuf": "google",
+    "mat-io": "matio",
     "python-multipart": "python_multipart",
 }
 # Starlette needs it for forms. Of Plotly and Swagger UI files are sent to browsers.
@@ -97,7 +98,10 @@ def test_the_image_has_the_locked_versions_of_a_server_and_no_test_tools() -> No
     assert {*image.items()} < {*whole.items()}
     served = list_declared("server", "postgres")
     assert served - {*image} == set()
-    assert (list_declared("test") - served) & {*image} == {"jsonschema", "packaging"}  # for Ray
+    assert (list_declared("test") - served) & {*image} == {
+        *("jsonschema", "packaging"),  # for Ray
+        "pandas",  # for mat-io
+    }
 
 
 # Without the libraries of a server: as after a plain `pip install lagid`.

@@ -1,13 +1,15 @@
 """Examples of the OpenAPI document: a request for each operation, and values of its parameters.
 
 They build on each other: `simulate_dataset` and `derive_dataset` store the recordings that the
-others name. Identifiers of jobs and runs stand for those of the reader.
+others name; that of another logger is the reader's. Identifiers of jobs and runs stand for those of
+the reader.
 """
 
 from collections.abc import Mapping
 from typing import Any
 
 DATASET, PART = "heating", "heating, begin"
+OTHER_LOGGER = "room"
 DATASET_ID = "ds_01kb3v8x4j7q2r9s5t6w0y1z29"
 JOB = "job_01kb3v8x4m7q2r9s5t6w0y1z2a"
 RUN = "run_01kb3v8x4n7q2r9s5t6w0y1z2b"
@@ -88,6 +90,9 @@ BODIES: Mapping[str, Mapping[str, Any]] = {
             **_RECORD,
             "noise": {"sigma": 0.05, "seed": 1},
         }
+    },
+    "join_datasets": {
+        "application/json": {"name": "heating and room", "datasets": [DATASET, OTHER_LOGGER]}
     },
     "derive_dataset": {
         "application/json": {

@@ -40,12 +40,14 @@ from service.datasets.dataset_schemas import (
     DatasetOut,
     DatasetPage,
     DeriveIn,
+    JoinIn,
     LineageOut,
     SignalsOut,
     SimulateIn,
 )
 from service.datasets.stored_recordings import load_recording
 from service.formats.limits import UploadLimits
+from service.formats.read_options import Clock, build_options
 from service.formats.tabular.csv_recordings import generate_csv
 from service.items.item_schemas import DeletedOut, EditIn
 from service.repositories.dataset_rows import DatasetRepository, StoredDataset
@@ -81,6 +83,36 @@ Segments = Annotated[
 SampleTime = Annotated[
     float | None, Query(gt=0, description="sampling period in s, for a file without a time column")
 ]
+Columns = Annotated[
+    str | None,
+    Query(
+        description="names of the columns of a file without a header, `t,u,,y [V]`; a column with "
+        "an empty name is left out"
+    ),
+]
+
+Missing = Annotated[
+    str | None,
+    Query(
+        description="words and numbers that mark bad data, `-9999,Offline`; if there are any, no "
+        "other number is taken for one, and with `none` no number is"
+    ),
+]
+
+Exclude = Annotated[
+    str | None,
+    Query(
+        description="ranges of times (s) or values, and words of a column, separated by commas: "
+        "`t=100:200,flow=90:,state=Bad`. Rows of times or words are cut out, values are missing"
+    ),
+]
+McapClock = Annotated[
+    Clock | None,
+    Query(
+        description="times of an MCAP file: when a message was logged (the default) or sent, or "
+        "the stamp in its header"
+    ),
+]
 
 
 @router.post("/datasets", status_code=201, openapi_extra=UPLOAD_BODY, responses=EXISTING_DATASET)
@@ -91,6 +123,10 @@ async def add_dataset(
     name: Name = None,
     segments: Segments = None,
     sample_time: SampleTime = None,
+    columns: Columns = None,
+    missing: Missing = None,
+    exclude: Exclude = None,
+    clock: McapClock = None,
 ) -> DatasetOut:
     """Store a recording: CSV or other text, Excel, Parquet, NumPy, MATLAB or MCAP.
 
@@ -109,10 +145,16 @@ async def add_dataset(
             sha256=upload.sha256,
             suffix=upload.suffix or Path(name or "").suffix,
             name=name or upload.name,
-            segments=[column.strip() for column in (segments or "").split(",") if column.strip()],
-            sample_time=sample_time,
-            limits=UploadLimits(
-                file_bytes=settings.max_upload_bytes, memory_bytes=parts.readers.memory_bytes
+            options=build_options(
+                sample_time=sample_time,
+                segments=segments,
+                columns=columns,
+                missing=missing,
+                exclude=exclude,
+                clock=clock,
+                limits=UploadLimits(
+                    file_bytes=settings.max_upload_bytes, memory_bytes=parts.readers.memory_bytes
+                ),
             ),
         )
     return _dataset_response(stored, response, name)
@@ -134,6 +176,13 @@ def derive_dataset(
 ) -> DatasetOut:
     """Derive a dataset from another, by its id or name: add noise, resample, trim, select etc."""
     stored = datasets.derive_dataset(parts.database, parts.store, parts.readers, dataset_id, body)
+    return _dataset_response(stored, response, body.name)
+
+
+@router.post("/datasets:join", status_code=201, responses=EXISTING_DATASET)
+def join_datasets(body: JoinIn, parts: PartsDep, response: Response) -> DatasetOut:
+    """Join recordings of several loggers on one clock; nothing is resampled."""
+    stored = datasets.join_datasets(parts.database, parts.store, body)
     return _dataset_response(stored, response, body.name)
 
 

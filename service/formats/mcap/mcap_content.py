@@ -1,8 +1,9 @@
 """Read all channels of an MCAP file as columns, within limits."""
 
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import BinaryIO, Final
+from typing import BinaryIO, Final, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -17,18 +18,27 @@ from service.formats.mcap.mcap_messages import (
     UnreadableMessages,
     choose_decoder,
     find_flat_layout,
+    split_stamps,
 )
 from service.formats.mcap.mcap_records import (
     RECORD_HEAD,
+    CutOffFile,
     RawRecord,
     RecordCursor,
     decompress_chunk,
     describe_opcode,
     iterate_records,
 )
+from service.formats.mcap.mcap_writer import MCAP_MAGIC
 from service.formats.mcap.topics import LATEST_NS
-from sysid.core.errors import UnreadableFile
+from service.formats.read_options import Clock
+from sysid.core.errors import Advice, UnreadableFile
 
+_CLOCK_WORDS: Final[Mapping[Clock, str]] = {
+    "log": "log time",
+    "publish": "publish time",
+    "stamp": "stamp in a header, such as header.stamp",
+}
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 
 
@@ -45,24 +55,40 @@ class McapChannel:
 
 @dataclass(eq=False)
 class McapContent:
-    """Content of a file: channels by number, and metadata records by name."""
+    """Content of a file: channels by number, and metadata records by name.
+
+    `cut` is the error of a file that ends inside a record; None if it is whole.
+    """
 
     channels: dict[int, McapChannel] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    cut: CutOffFile | None = None
 
 
 def read_content(binary: BinaryIO, size: int, limits: UploadLimits) -> McapContent:
-    """Read a whole file in one pass.
+    """Read a file in one pass; of one that is cut off, its whole chunks and messages.
 
     Raises
     ------
     UnreadableFile
-        If the file is damaged, exceeds a limit, or contradicts itself; with the byte.
+        If the file is damaged, exceeds a limit, or contradicts itself; with the byte. Also if it
+        is cut off before its first message.
     """
     reader = _ContentReader(limits)
-    for record in iterate_records(binary, size, limits):
-        reader.add_record(record)
+    try:
+        for record in iterate_records(binary, size, limits):
+            reader.add_record(record)
+    except CutOffFile as cut:
+        if not reader.has_messages or _has_end(binary, size):
+            raise
+        reader.content.cut = cut
     return reader.content
+
+
+def _has_end(binary: BinaryIO, size: int) -> bool:
+    """Whether a file has its end, so that a record past it has a damaged length."""
+    binary.seek(size - len(MCAP_MAGIC))
+    return binary.read(len(MCAP_MAGIC)) == MCAP_MAGIC
 
 
 class _ContentReader:
@@ -72,6 +98,11 @@ class _ContentReader:
         self._schemas: dict[int, MessageSchema] = {}
         self._schemas_of: dict[int, tuple[int, str, str]] = {}
         self._messages = self._total = 0
+
+    @property
+    def has_messages(self) -> bool:
+        """Whether there is a message so far."""
+        return self._messages > 0
 
     def add_record(self, record: RawRecord) -> None:
         """Add a record of the data section."""
@@ -182,7 +213,7 @@ class _ContentReader:
             record.raise_invalid(
                 f"has {len(record.body)} bytes; its head alone has {_MESSAGE_HEAD.size}"
             )
-        number, _, log_time, _ = _MESSAGE_HEAD.unpack_from(record.body)
+        number, _, log_time, published = _MESSAGE_HEAD.unpack_from(record.body)
         source = self.content.channels.get(number)
         if source is None:
             record.raise_invalid(f"refers to channel {number}, which is not defined before it")
@@ -192,7 +223,8 @@ class _ContentReader:
         if source.decode is None:
             return
         try:
-            source.columns.add_message(log_time, source.decode(record.body[_MESSAGE_HEAD.size :]))
+            numbers = source.decode(record.body[_MESSAGE_HEAD.size :])
+            source.columns.add_message(log_time, published, numbers)
         except UnreadableMessages as reason:
             record.raise_invalid(f"of topic {source.topic!r} cannot be read: {reason}")
         if source.columns.count_names() > self._limits.channels:
@@ -206,15 +238,51 @@ class _ContentReader:
             )
 
 
-def sort_columns(
-    source: McapChannel,
-) -> tuple[NDArray[np.uint64], dict[str, NDArray[np.float64]], bool]:
-    """Return log times and columns sorted by time, and whether sorting changed them."""
-    times, columns = source.columns.concatenate_blocks()
+class SortedMessages(NamedTuple):
+    """Messages of a channel in order of a clock: times in ns, and columns without their stamps.
+
+    `was_sorted` says that they were in this order. `delays` has the times (ns) by which the log
+    comes after the other clocks.
+    """
+
+    times: NDArray[np.uint64]
+    columns: dict[str, NDArray[np.float64]]
+    was_sorted: bool
+    delays: dict[Clock, NDArray[np.float64]]
+
+
+def sort_columns(source: McapChannel, clock: Clock = "log") -> SortedMessages:
+    """Return the messages of a channel in the order of a clock.
+
+    Raises
+    ------
+    UnreadableFile
+        If the messages have no such time.
+    """
+    log_times, published, columns = source.columns.concatenate_blocks()
+    stamps, columns = split_stamps(columns)
+    clocks: dict[Clock, NDArray[np.uint64]] = {"log": log_times}
+    if published.size and published.all():
+        clocks["publish"] = published
+    if stamps is not None:
+        clocks["stamp"] = stamps
+    if columns and clock not in clocks:
+        raise UnreadableFile(
+            f"topic {source.topic!r} has no {_CLOCK_WORDS[clock]}; its clocks are "
+            f"{', '.join(clocks)}: ",
+            Advice("give one of them as ", "clock"),
+        )
+    times = clocks.get(clock, log_times)
+    delays: dict[Clock, NDArray[np.float64]] = {
+        name: (log_times.astype(np.int64) - other.astype(np.int64)).astype(np.float64)
+        for name, other in clocks.items()
+        if name != "log" and not np.array_equal(other, log_times)
+    }
     if np.all(times[1:] >= times[:-1]):
-        return times, columns, False
+        return SortedMessages(times, columns, True, delays)
     order = np.argsort(times, kind="stable")
-    return times[order], {name: values[order] for name, values in columns.items()}, True
+    ordered = {name: values[order] for name, values in columns.items()}
+    return SortedMessages(times[order], ordered, False, delays)
 
 
 def build_no_signal_error(content: McapContent) -> UnreadableFile:

@@ -38,6 +38,7 @@ from service.formats.mcap.topics import (
     make_topic,
     parse_manifest,
 )
+from service.formats.read_options import Clock
 from sysid.core.errors import InvalidRecord, UnreadableFile
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, History, Record, Recording
@@ -181,20 +182,20 @@ def write_fitted_outputs(
             groups.append([fit])
     topics = []
     for number, group in enumerate(groups):
-        channels = [channel for fit in group for channel in _to_channels(fit)]
+        channels = [channel for fit in group for channel in _to_channels(fit, started_at)]
         names = [
             f"{fit.name}{suffix}" for fit in group for suffix in ("", "_measured", "_residual")
         ]
         path = "/fit" if number == 0 else f"/fit/{number + 1}"
         topics.append(make_topic(path, channels, names))
-    topics += _build_input_topics(inputs)
+    topics += _build_input_topics(inputs, started_at)
     recording = Recording(
         tuple(channel for topic in topics for channel in topic.channels), started_at=started_at
     )
     _write_file(target, topics, build_manifest(recording, topics, {}), run)
 
 
-def _build_input_topics(inputs: Sequence[FittedInput]) -> list[Topic]:
+def _build_input_topics(inputs: Sequence[FittedInput], started_at: datetime | None) -> list[Topic]:
     """Build the topics of inputs, each of one experiment and of equal times."""
     topics: list[Topic] = []
     for name, group in groupby(inputs, key=lambda one: one.experiment):
@@ -205,6 +206,7 @@ def _build_input_topics(inputs: Sequence[FittedInput]) -> list[Topic]:
                 one.channel.values,
                 one.channel.unit,
                 one.channel.hold,
+                started_at=started_at,
             )
             for one in group
         )
@@ -215,7 +217,7 @@ def _build_input_topics(inputs: Sequence[FittedInput]) -> list[Topic]:
     return topics
 
 
-def _to_channels(fit: FittedOutput) -> tuple[Channel, ...]:
+def _to_channels(fit: FittedOutput, started_at: datetime | None) -> tuple[Channel, ...]:
     """Return the channels of one output; '/' separates experiment, output and signal."""
     prefix = f"{fit.experiment}/{fit.name}"
     values = (
@@ -224,7 +226,8 @@ def _to_channels(fit: FittedOutput) -> tuple[Channel, ...]:
         ("residual", fit.measured - fit.simulated),
     )
     return tuple(
-        Channel(f"{prefix}/{signal}", fit.times, data, fit.unit) for signal, data in values
+        Channel(f"{prefix}/{signal}", fit.times, data, fit.unit, started_at=started_at)
+        for signal, data in values
     )
 
 
@@ -251,6 +254,7 @@ def _write_file(
 EPOCH_THRESHOLD_NS = 10**17
 """Log times (ns) from this on (three years) are clock times, counted from the first one."""
 
+_NO_TOPIC: tuple[FloatArray, Mapping[str, FloatArray]] = (np.empty(0), {})
 _TopicColumns = Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]]
 """Times and columns of every topic."""
 
@@ -258,14 +262,18 @@ McapSource = str | os.PathLike[str] | bytes | BinaryIO
 
 
 def read_mcap(source: McapSource, limits: UploadLimits = DEFAULT_LIMITS) -> Recording:
-    """Read a recording from an MCAP file (path, content, or seekable stream).
+    """Read a recording from a whole MCAP file (path, content, or seekable stream).
 
     Raises
     ------
     UnreadableFile
-        If the file is damaged, too large, or holds no signal.
+        If the file is damaged, cut off, too large, or holds no signal.
     """
-    return read_mcap_with_notes(source, limits)[0]
+    with _open_binary(source) as (binary, size):
+        content = read_content(binary, size, limits)
+    if content.cut is not None:
+        raise content.cut
+    return _build_recording(content, limits, "log")[0]
 
 
 def read_fitted_outputs(
@@ -304,23 +312,33 @@ def read_fitted_outputs(
 
 
 def read_mcap_with_notes(
-    source: McapSource, limits: UploadLimits
+    source: McapSource, limits: UploadLimits, clock: Clock = "log"
 ) -> tuple[Recording, tuple[str, ...]]:
     """Read a recording, with notes on what was skipped or changed.
+
+    Of a file that is cut off, what is whole is read.
 
     Raises
     ------
     UnreadableFile
-        If the file is damaged, too large, or holds no signal.
+        If the file is damaged, too large, or holds no signal, or its messages lack the clock.
     """
     with _open_binary(source) as (binary, size):
         content = read_content(binary, size, limits)
+    recording, notes = _build_recording(content, limits, clock)
+    if content.cut is not None:
+        what, last = content.cut.what.partition("; it is truncated")[0], recording.stop
+        notes = (*notes, f"{what}. What is whole was read, up to {last:.6g} s")
+    return recording, notes
+
+
+def _build_recording(
+    content: McapContent, limits: UploadLimits, clock: Clock
+) -> tuple[Recording, tuple[str, ...]]:
     metadata = content.metadata.get(DATASET_RECORD)
-    return (
-        _build_foreign_recording(content, limits)
-        if metadata is None
-        else (_build_own_recording(content, metadata), ())
-    )
+    if metadata is None:
+        return _build_foreign_recording(content, limits, clock)
+    return _build_own_recording(content, metadata)
 
 
 @contextmanager
@@ -336,7 +354,9 @@ def _open_binary(source: McapSource) -> Iterator[tuple[BinaryIO, int]]:
         yield source, size
 
 
-def _build_own_recording(content: McapContent, metadata: Mapping[str, str]) -> Recording:
+def _build_own_recording(
+    content: McapContent, metadata: Mapping[str, str]
+) -> tuple[Recording, tuple[str, ...]]:
     try:
         manifest = parse_manifest(metadata)
     except ValueError as error:
@@ -347,28 +367,37 @@ def _build_own_recording(content: McapContent, metadata: Mapping[str, str]) -> R
     for source in content.channels.values():
         if source.topic in manifest.clocks:
             topics[source.topic] = _decode_topic(source, manifest)
+    whole, lost = list(manifest.channels), list[str]()
+    if content.cut is not None:
+        whole = [entry for entry in whole if entry.field in topics.get(entry.topic, _NO_TOPIC)[1]]
+        lost = [entry.name for entry in manifest.channels if entry not in whole]
+        if not whole:
+            raise content.cut
     channels = tuple(
         _attach_repeats(
-            _attach_history(_build_channel(entry, topics), manifest, topics), manifest, topics
+            _attach_history(_build_channel(entry, topics, manifest.time_unit), manifest, topics),
+            manifest,
+            topics,
         )
-        for entry in manifest.channels
+        for entry in whole
     )
-    return Recording(channels, manifest.segments, manifest.started_at)
+    notes = (f"no samples are left of {', '.join(lost)}",) if lost else ()
+    return Recording(channels, manifest.segments, manifest.started_at), notes
 
 
 def _decode_topic(
     source: McapChannel, manifest: Manifest
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
-    log_times, columns, _ = sort_columns(source)
+    log_times, columns = sort_columns(source)[:2]
     times = manifest.clocks[source.topic].to_times(log_times, columns.get(TIME_FIELD))
     if not np.all(np.isfinite(times)) or np.any(np.diff(times) < 0):
         raise UnreadableFile(f"the times of topic {source.topic!r} decrease or are not finite")
     return times, columns
 
 
-def _build_channel(entry: ChannelEntry, topics: _TopicColumns) -> Channel:
+def _build_channel(entry: ChannelEntry, topics: _TopicColumns, time_unit: str) -> Channel:
     times, values = _find_column(f"channel {entry.name!r}", entry.topic, entry.field, topics)
-    return Channel(entry.name, times, values, entry.unit, entry.hold)
+    return Channel(entry.name, times, values, entry.unit, entry.hold, time_unit=time_unit)
 
 
 def _attach_history(channel: Channel, manifest: Manifest, topics: _TopicColumns) -> Channel:
@@ -405,10 +434,10 @@ def _find_column(
 
 
 def _build_foreign_recording(
-    content: McapContent, limits: UploadLimits
+    content: McapContent, limits: UploadLimits, clock: Clock
 ) -> tuple[Recording, tuple[str, ...]]:
-    topics = [(source, *sort_columns(source)) for source in content.channels.values()]
-    usable = [topic for topic in topics if topic[2]]
+    topics = [(source, sort_columns(source, clock)) for source in content.channels.values()]
+    usable = [(source, messages) for source, messages in topics if messages.columns]
     if not usable:
         raise build_no_signal_error(content)
     notes = [
@@ -417,26 +446,41 @@ def _build_foreign_recording(
         if source.refusal
     ]
     notes += [
-        f"topic {topic[0].topic!r} was sorted: it was not in order of time"
-        for topic in usable
-        if topic[3]
+        f"topic {source.topic!r} was sorted: it was not in order of time"
+        for source, messages in usable
+        if not messages.was_sorted
     ]
-    first = min(int(times[0]) for _, times, _, _ in usable)
+    notes += [
+        _describe_delay(source.topic, name, delays)
+        for source, messages in usable
+        for name, delays in messages.delays.items()
+    ]
+    first = min(int(messages.times[0]) for _, messages in usable)
     start = first if first >= EPOCH_THRESHOLD_NS else 0
     if start:
         notes.append(f"times are counted from the first message, at {start} ns of the file's clock")
     channels: dict[str, Channel] = {}
-    for source, log_times, columns, _ in usable:
-        times = (log_times - np.uint64(start)).astype(np.float64) / 1e9
-        for field, values in columns.items():
+    for source, messages in usable:
+        times = (messages.times - np.uint64(start)).astype(np.float64) / 1e9
+        for field, values in messages.columns.items():
             name = _choose_free_name(source.topic, field, alone=len(usable) == 1, taken=channels)
             channels[name] = Channel(name, times, values)
     if len(channels) > limits.channels:
         raise UnreadableFile(
             f"the file has {len(channels)} signals; at most {limits.channels} are read"
         )
-    clock = find_clock_start(start / 1e9)
-    return Recording(tuple(channels.values()), started_at=clock), tuple(notes)
+    moment = find_clock_start(start / 1e9)
+    return Recording(tuple(channels.values()), started_at=moment), tuple(notes)
+
+
+def _describe_delay(topic: str, clock: Clock, delays: FloatArray) -> str:
+    """Describe by how much the log comes after another clock of the same messages."""
+    least, middle, most = (float(x) / 1e6 for x in np.quantile(delays, (0.0, 0.5, 1.0)))
+    word = {"publish": "publish time", "stamp": "stamp in the header"}.get(clock, clock)
+    return (
+        f"topic {topic!r}: the log time comes {middle:.4g} ms after the {word} in the median, "
+        f"{least:.4g} to {most:.4g} ms. The clock is chosen by clock={clock}"
+    )
 
 
 def _choose_free_name(topic: str, field: str, *, alone: bool, taken: Mapping[str, object]) -> str:

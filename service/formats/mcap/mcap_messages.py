@@ -160,7 +160,9 @@ def encode_tag(field: NumericField) -> bytes:
 MAX_NESTING: Final = 4
 """Depth to which nested messages are read."""
 
-TIME_MESSAGES: Final = ("google.protobuf.Timestamp", "google.protobuf.Duration")
+_STAMP_SECONDS: Final = re.compile(r"(?P<name>.+)\.(?:sec|secs|seconds)")
+_STAMP_PARTS: Final = ("nanosec", "nsec", "nsecs", "nanos", "nanoseconds")
+TIME_MESSAGES: Final = ("google.protobuf.Duration",)
 NumbersByName = Mapping[str, float]
 MessageDecoder = Callable[[bytes], NumbersByName]
 
@@ -303,6 +305,37 @@ def _get_number(message: Message, path: tuple[str, ...]) -> float:
     return float(value)  # type: ignore[arg-type]
 
 
+class MessageBlock(NamedTuple):
+    """Log times and publish times (ns) of messages, and their numbers."""
+
+    times: NDArray[np.uint64]
+    published: NDArray[np.uint64]
+    columns: dict[str, NDArray[np.float64]]
+
+
+def split_stamps(
+    columns: Mapping[str, NDArray[np.float64]],
+) -> tuple[NDArray[np.uint64] | None, dict[str, NDArray[np.float64]]]:
+    """Split the stamps of messages (ns) off their signals; None if not all have one.
+
+    A stamp has seconds and nanoseconds, below a name such as ``header.stamp`` or ``timestamp``.
+    The first one is taken, and none of its parts is a signal.
+    """
+    pairs = []
+    for name in columns:
+        if match := _STAMP_SECONDS.fullmatch(name):
+            parts = (f"{match['name']}.{part}" for part in _STAMP_PARTS)
+            pairs += [(name, part) for part in parts if part in columns]
+    used = {name for pair in pairs for name in pair}
+    signals = {name: values for name, values in columns.items() if name not in used}
+    if not pairs:
+        return None, signals
+    seconds, rest = (columns[name] for name in pairs[0])
+    if not (np.isfinite(seconds) & np.isfinite(rest)).all() or np.any(seconds <= 0):
+        return None, signals
+    return seconds.astype(np.uint64) * np.uint64(10**9) + rest.astype(np.uint64), signals
+
+
 class MessageColumns:
     """Columns of one channel, collected from its messages.
 
@@ -310,8 +343,8 @@ class MessageColumns:
     """
 
     def __init__(self) -> None:
-        self._blocks: list[tuple[NDArray[np.uint64], dict[str, NDArray[np.float64]]]] = []
-        self._times = array("Q")
+        self._blocks: list[MessageBlock] = []
+        self._times, self._published = array("Q"), array("Q")
         self._columns: dict[str, array[float]] = {}
 
     def add_block(self, layout: FlatLayout, messages: NDArray[np.void]) -> None:
@@ -320,14 +353,16 @@ class MessageColumns:
         columns = {
             name: messages[f"value{i}"].astype(np.float64) for i, name in enumerate(layout.names)
         }
-        self._blocks.append((messages["log_time"].copy(), columns))
+        times, published = messages["log_time"].copy(), messages["publish_time"].copy()
+        self._blocks.append(MessageBlock(times, published, columns))
 
-    def add_message(self, log_time: int, numbers: NumbersByName) -> None:
+    def add_message(self, log_time: int, published: int, numbers: NumbersByName) -> None:
         """Add one message."""
         for name in numbers:
             if name not in self._columns:
                 self._columns[name] = array("d", [float("nan")]) * len(self._times)
         self._times.append(log_time)
+        self._published.append(published)
         for name, column in self._columns.items():
             column.append(numbers.get(name, float("nan")))
 
@@ -335,22 +370,27 @@ class MessageColumns:
         """Count the names seen since the last block."""
         return len(self._columns)
 
-    def concatenate_blocks(self) -> tuple[NDArray[np.uint64], dict[str, NDArray[np.float64]]]:
-        """Return log times and columns of all messages, in the order of the file."""
+    def concatenate_blocks(self) -> "MessageBlock":
+        """Return log times, publish times and columns of all messages, in the order of the file."""
         self._close_block()
-        names = list(dict.fromkeys(name for _, columns in self._blocks for name in columns))
+        names = list(dict.fromkeys(name for block in self._blocks for name in block.columns))
         if not names:
-            return np.empty(0, np.uint64), {}
-        times = np.concatenate([block for block, _ in self._blocks])
-        return times, {
+            return MessageBlock(np.empty(0, np.uint64), np.empty(0, np.uint64), {})
+        columns = {
             name: np.concatenate(
-                [columns.get(name, np.full(block.size, np.nan)) for block, columns in self._blocks]
+                [one.columns.get(name, np.full(one.times.size, np.nan)) for one in self._blocks]
             )
             for name in names
         }
+        times = np.concatenate([block.times for block in self._blocks])
+        return MessageBlock(
+            times, np.concatenate([block.published for block in self._blocks]), columns
+        )
 
     def _close_block(self) -> None:
         if self._times:
             columns = {n: np.frombuffer(c, np.float64) for n, c in self._columns.items()}
-            self._blocks.append((np.frombuffer(self._times, np.uint64), columns))
-            self._times, self._columns = array("Q"), {}
+            times = np.frombuffer(self._times, np.uint64)
+            published = np.frombuffer(self._published, np.uint64)
+            self._blocks.append(MessageBlock(times, published, columns))
+            self._times, self._published, self._columns = array("Q"), array("Q"), {}

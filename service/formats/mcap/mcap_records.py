@@ -19,6 +19,7 @@ from service.formats.limits import UploadLimits
 from service.formats.mcap.mcap_writer import FOOTER_BODY, MCAP_MAGIC
 from sysid.core.errors import UnreadableFile
 
+_BLOCK_BYTES: Final = 1 << 20
 RECORD_HEAD: Final = struct.Struct("<BQ")
 _OPCODE_NAMES: Final = {int(opcode): opcode.name.lower().replace("_", " ") for opcode in Opcode}
 _SUMMARY_OPCODES: Final = {
@@ -102,6 +103,10 @@ class RecordCursor:
         return entries
 
 
+class CutOffFile(UnreadableFile):
+    """A file that ends inside a record; the records before it are whole."""
+
+
 class _CheckedStream:
     """The file as it is read: position, remaining bytes, checksum since the last reset."""
 
@@ -112,7 +117,7 @@ class _CheckedStream:
         left = self.size - self.at
         data = self._stream.read(length) if length <= left else b""
         if len(data) != length:
-            raise UnreadableFile(
+            raise CutOffFile(
                 f"the file ends inside {what} ({length} bytes needed, {left} left); "
                 "it is truncated. `mcap recover` writes what is whole to another file",
                 byte=self.at,
@@ -121,12 +126,21 @@ class _CheckedStream:
         self.at += length
         return data
 
+    def has_only_zeros(self) -> bool:
+        """Whether nothing but zeros is left; reads on."""
+        while data := self._stream.read(_BLOCK_BYTES):
+            if data.count(0) < len(data):
+                return False
+        return True
+
 
 def iterate_records(binary: BinaryIO, size: int, limits: UploadLimits) -> Iterator[RawRecord]:
     """Yield every record of the data section, header first; then check the end.
 
     Raises
     ------
+    CutOffFile
+        If the file ends inside a record, or its rest was never written.
     UnreadableFile
         At the first invalid record; with the byte.
     """
@@ -156,6 +170,8 @@ def _read_record(stream: _CheckedStream, limits: UploadLimits) -> RawRecord:
     opcode, length = RECORD_HEAD.unpack(
         stream.read_exactly(RECORD_HEAD.size, "the head of a record")
     )
+    if opcode == 0 and stream.has_only_zeros():
+        raise CutOffFile("the rest of the file has zeros alone; it was never written", byte=start)
     if opcode == 0:
         raise UnreadableFile("a record has opcode 0, which is no record", byte=start)
     if length > limits.record_bytes:

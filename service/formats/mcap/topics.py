@@ -8,8 +8,8 @@ each message carries its time in a separate field.
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from datetime import datetime
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime, timedelta
 from math import floor
 from typing import Any, Literal, get_args
 
@@ -25,6 +25,7 @@ Nanoseconds = NDArray[np.uint64]
 LATEST_NS = 2**63
 LATEST_S = LATEST_NS / 1e9
 TIME_FIELD = "time_s"
+_YEAR_1970 = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +36,9 @@ class TopicClock:
     ----------
     rule : {"nanoseconds", "regular", "field"}
     epoch : int
-        Time (s) of the file's nanosecond 0; not 0 only if times are negative.
+        Time (s) of the file's nanosecond `origin`; not 0 only if times are negative.
+    origin : int
+        Moment of the epoch in ns since 1970, so that viewers show the day; 0 if it is not known.
     start, period : float
         First time and sampling period, for ``regular``.
     """
@@ -44,6 +47,7 @@ class TopicClock:
     epoch: int = 0
     start: float = 0.0
     period: float = 0.0
+    origin: int = 0
 
     def to_times(self, log_times: Nanoseconds, field: FloatArray | None) -> FloatArray:
         """Return the times in s."""
@@ -54,50 +58,70 @@ class TopicClock:
                 log_times.size, dtype=np.float64
             )
             return grid
-        return _to_seconds(log_times, self.epoch)
+        return _to_seconds(log_times, self.epoch, self.origin)
 
     def to_dict(self) -> dict[str, object]:
         """Return the clock as an entry of the file's metadata."""
-        return {"rule": self.rule, "epoch": self.epoch, "start": self.start, "period": self.period}
+        return asdict(self)
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, object]) -> "TopicClock":
         """Return the inverse of `to_dict`; ValueError for an invalid entry."""
         rule, epoch = entry.get("rule"), entry.get("epoch")
-        start, period = entry.get("start"), entry.get("period")
-        if rule not in ("nanoseconds", "regular", "field") or type(epoch) is not int:
+        start, period, origin = entry.get("start"), entry.get("period"), entry.get("origin", 0)
+        if (
+            rule not in ("nanoseconds", "regular", "field")
+            or not type(epoch) is type(origin) is int
+        ):
             raise ValueError(f"{entry!r} is not a clock rule")
         if not isinstance(start, int | float) or not isinstance(period, int | float):
             raise ValueError(f"{entry!r} is not a clock rule")
+        if not 0 <= origin < LATEST_NS:
+            raise ValueError(f"{entry!r} exceeds the range of a file's clock")
         if not (-LATEST_S < epoch <= 0 and abs(start) < LATEST_S and 0 <= period < LATEST_S):
             raise ValueError(f"{entry!r} exceeds the range of a file's clock")
-        return cls(rule, epoch, float(start), float(period))
+        return cls(rule, epoch, float(start), float(period), origin)
 
 
-def choose_clock(times: FloatArray) -> tuple[TopicClock, Nanoseconds]:
+def choose_clock(
+    times: FloatArray, started_at: datetime | None = None
+) -> tuple[TopicClock, Nanoseconds]:
     """Choose the clock of non-decreasing times (s), and return the times on it.
+
+    With the moment of time 0 s the file's clock counts from 1970; without a zone it is taken for
+    UTC, so that a viewer shows what the logger's clock showed.
 
     Raises
     ------
     ValueError
         If the times exceed the range of a file's clock (292 years).
     """
-    epoch = min(0, floor(float(times[0])))
-    if epoch <= -LATEST_S or float(times[-1]) - epoch >= LATEST_S:
+    origin = _find_origin(started_at, times)
+    epoch = 0 if origin else min(0, floor(float(times[0])))
+    if epoch <= -LATEST_S or float(times[-1]) - epoch + origin / 1e9 >= LATEST_S:
         raise ValueError(f"times up to {float(times[-1])!r} s do not fit into 63 bits of ns")
-    log_times = np.rint((times - epoch) * 1e9).astype(np.uint64)
-    if np.array_equal(_to_seconds(log_times, epoch), times):
-        return TopicClock("nanoseconds", epoch), log_times
+    log_times = (np.rint((times - epoch) * 1e9).astype(np.int64) + origin).astype(np.uint64)
+    if np.array_equal(_to_seconds(log_times, epoch, origin), times):
+        return TopicClock("nanoseconds", epoch, origin=origin), log_times
     for period in _propose_periods(times):
-        clock = TopicClock("regular", epoch, float(times[0]), period)
+        clock = TopicClock("regular", epoch, float(times[0]), period, origin)
         if np.array_equal(clock.to_times(log_times, None), times):
             return clock, log_times
-    return TopicClock("field", epoch), log_times
+    return TopicClock("field", epoch, origin=origin), log_times
 
 
-def _to_seconds(log_times: Nanoseconds, epoch: int) -> FloatArray:
+def _find_origin(started_at: datetime | None, times: FloatArray) -> int:
+    """Find the ns since 1970 of time 0 s; 0 if it is not known, or some times are earlier."""
+    if started_at is None:
+        return 0
+    moment = started_at if started_at.tzinfo else started_at.replace(tzinfo=UTC)
+    origin = (moment - _YEAR_1970) // timedelta(microseconds=1) * 1000
+    return origin if origin + float(times[0]) * 1e9 > 0 else 0
+
+
+def _to_seconds(log_times: Nanoseconds, epoch: int, origin: int) -> FloatArray:
     # A quotient of whole numbers is correctly rounded, like the decimal number that it equals.
-    signed = log_times.astype(np.int64) + epoch * 10**9
+    signed = log_times.astype(np.int64) + (epoch * 10**9 - origin)
     return np.asarray(signed / 1e9, dtype=np.float64)
 
 
@@ -122,6 +146,7 @@ RESERVED_KEYS = (
     "history",
     "repeats",
     "started_at",
+    "time_unit",
 )
 
 
@@ -153,7 +178,7 @@ class Topic:
 def make_topic(path: str, channels: Sequence[Channel], names: Sequence[str]) -> Topic:
     """Make the topic of channels with equal times; `names` are the wanted names of its fields."""
     times = channels[0].times
-    clock, log_times = choose_clock(times)
+    clock, log_times = choose_clock(times, channels[0].started_at)
     extra = (times,) if clock.rule == "field" else ()
     fields = make_identifiers((TIME_FIELD, *names))[1:]
     return Topic(path, tuple(channels), fields, clock, log_times, extra)
@@ -179,7 +204,13 @@ def group_into_topics(recording: Recording, root: str = "/signals") -> tuple[Top
 def group_history_topics(recording: Recording) -> tuple[Topic, ...]:
     """Group the samples before the start of the record into topics; empty if there are none."""
     channels = tuple(
-        Channel(channel.name, channel.history.times, channel.history.values, channel.unit)
+        replace(
+            channel,
+            times=channel.history.times,
+            values=channel.history.values,
+            history=None,
+            repeats=None,
+        )
         for channel in recording.channels
         if channel.history is not None and channel.history.times.size
     )
@@ -189,7 +220,7 @@ def group_history_topics(recording: Recording) -> tuple[Topic, ...]:
 def group_repeat_topics(recording: Recording) -> tuple[Topic, ...]:
     """Group the numbers of the repeats of pooled samples into topics; empty if there are none."""
     channels = tuple(
-        Channel(channel.name, channel.times, channel.repeats)
+        replace(channel, values=channel.repeats, unit="1", history=None, repeats=None)
         for channel in recording.channels
         if channel.repeats is not None
     )
@@ -225,6 +256,7 @@ def build_manifest(
     entries.sort(key=lambda entry: order.index(entry["name"]))
     clocks = {topic.path: topic.clock.to_dict() for topic in (*topics, *history, *repeats)}
     sampling, start = recording.sampling, recording.started_at
+    time_unit = recording.channels[0].time_unit
     return {
         "format": FORMAT_VERSION,
         "sample_time": f"{sampling.period:.12g}" if sampling.is_regular else "",
@@ -234,6 +266,7 @@ def build_manifest(
         "history": json.dumps(_list_places(history)),
         **({"repeats": json.dumps(_list_places(repeats))} if repeats else {}),
         **({} if start is None else {"started_at": start.isoformat()}),
+        **({} if time_unit == "s" else {"time_unit": time_unit}),
         **metadata,
     }
 
@@ -271,6 +304,7 @@ class Manifest:
     history: Mapping[str, tuple[str, str]]
     repeats: Mapping[str, tuple[str, str]]
     started_at: datetime | None = None
+    time_unit: str = "s"
 
 
 def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
@@ -303,6 +337,7 @@ def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
             history,
             repeats,
             datetime.fromisoformat(metadata["started_at"]) if "started_at" in metadata else None,
+            metadata.get("time_unit", "s"),
         )
     except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise ValueError(f"{type(error).__name__}: {error}") from None

@@ -8,11 +8,22 @@ from sysid.data.table_rules import CellKind
 
 MISSING: Final = frozenset(
     (
-        *("", "na", "n/a", "nan", "-nan", "null", "none", "-", "--", "---", "?"),
+        *("", "na", "n/a", "nan", "-nan", "null", "none", "-", "--", "---", "?", "."),
         *("#n/a", "#nv", "#na", "#div/0!", "#num!", "#value!", "#ref!"),  # of spreadsheets
     )
 )
 """Words of a missing value, in small letters."""
+BAD_WORDS: Final = frozenset(
+    (
+        *("bad", "bad input", "bad data", "bad quality", "i/o timeout", "io timeout", "no data"),
+        *("scan off", "scan timeout", "comm fail", "not connect", "configure", "shutdown"),
+        *("intf shut", "pt created", "no result", "no sample", "calc failed", "calc off"),
+        *("out of serv", "invalid data", "invalid", "equip fail", "under range", "over range"),
+        *("inp outrange", "arc off-line", "access denied", "undefined", "doubtful", "error"),
+        *("unavailable", "unknown", "timeout", "offline", "fault", "failed"),
+    )
+)
+"""Words that mark a bad value, in small letters; see `service.formats.tabular.bad_values`."""
 FLAGS: Final = {"true": 1.0, "false": 0.0}
 
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?|[+-]?inf(?:inity)?", re.I)
@@ -39,7 +50,7 @@ CLOCK_TIME: Final = re.compile(_CLOCK)
 def classify_cell(text: str) -> CellKind:
     """Return what a cell holds."""
     text = text.strip()
-    if text.lower() in MISSING:
+    if text.lower() in MISSING or text.lower() in BAD_WORDS:
         return "empty"
     if _NUMBER.fullmatch(text):
         return "number"

@@ -1,10 +1,11 @@
-"""Files of whole columns: arrays of NumPy and MATLAB, and Parquet."""
+"""Files of whole columns: arrays of NumPy, and Parquet."""
 
 import struct
 import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,7 +13,8 @@ import numpy as np
 from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
-from service.formats.limits import ReadOptions
+from service.formats.advice import name_columns
+from service.formats.read_options import ReadOptions
 from service.formats.tabular.table_columns import (
     ColumnValues,
     Table,
@@ -24,6 +26,7 @@ from service.formats.tabular.table_layout import (
     PEEK_ROWS,
     TableColumn,
     assign_roles,
+    check_count,
     classify_cells,
     read_headings,
 )
@@ -36,7 +39,7 @@ if TYPE_CHECKING:
 
 PERIOD_NAMES: Final = ("ts", "dt", "sample_time", "sampletime", "sampling_time", "sample_period")
 RATE_NAMES: Final = ("fs", "sample_rate", "samplerate", "sampling_rate", "sampling_frequency")
-_DAMAGES: Final = (
+DAMAGES: Final = (
     *(ValueError, TypeError, KeyError, IndexError, OSError, EOFError, AttributeError),
     *(NotImplementedError, zlib.error, struct.error, zipfile.BadZipFile),
 )
@@ -47,13 +50,11 @@ def read_numpy(path: Path, options: ReadOptions, notes: list[str]) -> Table:
     """Read the arrays of an ``.npz`` file, or the fields or columns of an ``.npy`` file."""
     try:
         arrays = _read_arrays(path)
-    except _DAMAGES as error:
-        raise _build_damage_error("NumPy", error) from None
+    except DAMAGES as error:
+        raise build_damage_error("NumPy", error) from None
     if "" in arrays:
-        raise UnreadableFile(
-            "the .npy file holds one array without names; write np.savez(file, t=t, u=u, y=y)"
-        )
-    return _build_array_table(arrays, options, notes)
+        arrays = _split_matrix(arrays[""], options)
+    return build_array_table(arrays, options, notes)
 
 
 def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -71,74 +72,42 @@ def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             return arrays
 
 
-def read_matlab(path: Path, options: ReadOptions, notes: list[str]) -> Table:
-    """Read the arrays of a MATLAB file (version 4 to 7), or the fields of its only structure."""
-    from scipy.io import loadmat, matlab
-
-    try:
-        content = loadmat(path, simplify_cells=True)
-    except (matlab.MatReadError, *_DAMAGES) as error:
-        raise _build_damage_error("MATLAB", error) from None
-    arrays = {str(name): value for name, value in content.items() if not name.startswith("__")}
-    for name, value in arrays.items():
-        if isinstance(value, matlab.MatlabOpaque | matlab.MatlabFunction):
-            what = "an object" if name == "None" else f"the object {name!r}"
-            raise UnreadableFile(
-                f"the MATLAB file holds {what}, such as iddata or timetable, which only MATLAB "
-                "can read. Save its arrays: y = z.y; u = z.u; Ts = z.Ts; save('file.mat', 'y', "
-                "'u', 'Ts', '-v7')"
-            )
-    return _build_array_table(_open_structure(arrays, notes), options, notes)
-
-
-def _open_structure(arrays: Mapping[str, Any], notes: list[str]) -> dict[str, Any]:
-    """Return the arrays, or the fields of the only structure if there are no arrays."""
-    structures = {name: value for name, value in arrays.items() if isinstance(value, Mapping)}
-    plain = {name: value for name, value in arrays.items() if name not in structures}
-    if any(np.size(value) > 1 and _is_signal(np.asarray(value)) for value in plain.values()):
-        if structures:
-            notes.append(f"the structures {', '.join(structures)} were left out")
-        return plain
-    if len(structures) != 1:
-        names = ", ".join(arrays) or "nothing"
+def _split_matrix(matrix: NDArray[Any], options: ReadOptions) -> dict[str, NDArray[Any]]:
+    """Split an array without names into its columns, which the user named."""
+    if matrix.ndim not in (1, 2):
+        raise UnreadableFile(f"the array has {matrix.ndim} dimensions; need rows and columns")
+    matrix = matrix.reshape(matrix.shape[0], -1)
+    if not options.columns:
         raise UnreadableFile(
-            f"the file holds {names}; need arrays such as t, u and y, or one structure with them"
+            "the .npy file holds one array without names; write np.savez(file, t=t, u=u, y=y), or ",
+            name_columns(matrix.shape[1], has_times=False),
         )
-    ((name, fields),) = structures.items()
-    notes.append(f"the fields of structure {name!r} were read")
-    if "signals" in fields:
-        return _open_simulink(fields)
-    inner = {key: value for key, value in fields.items() if isinstance(value, Mapping)}
-    is_shell = len(inner) == 1 and len(fields) == 1
-    return _open_structure(fields, notes) if is_shell else {**plain, **fields}
+    return {f"c{number}": column for number, column in enumerate(matrix.T, 1)}
 
 
-def _open_simulink(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the signals of Simulink's "structure with time", by their labels."""
-    signals = fields["signals"]
-    arrays = {"time": fields.get("time")}
-    for number, signal in enumerate([signals] if isinstance(signals, Mapping) else signals, 1):
-        label = signal.get("label") if isinstance(signal, Mapping) else None
-        name = label if isinstance(label, str) and label else f"signal{number}"
-        arrays[name] = signal.get("values") if isinstance(signal, Mapping) else signal
-    return arrays
+def build_array_table(arrays: Mapping[str, Any], options: ReadOptions, notes: list[str]) -> Table:
+    """Build the table of arrays by name; a scalar may be the sampling period.
 
-
-def _build_array_table(arrays: Mapping[str, Any], options: ReadOptions, notes: list[str]) -> Table:
+    Raises
+    ------
+    UnreadableFile
+        If there is no signal or no time.
+    """
     columns, left_out = _collect_columns(arrays)
     sample_time = options.sample_time
-    times = [name for name in columns if is_time_name(name) and not is_temperature_name(name)]
+    names = [name for name, _ in read_headings(options.columns or list(columns))]
+    times = [name for name in names if is_time_name(name) and not is_temperature_name(name)]
     if sample_time is None and not times:
         sample_time = _find_period(arrays, notes)
     if left_out:
         notes.append(f"{', '.join(left_out)} hold no samples of a signal and were left out")
-    return build_column_table(columns, ReadOptions(sample_time, options.segments, options.limits))
+    return build_column_table(columns, replace(options, sample_time=sample_time))
 
 
 def _collect_columns(arrays: Mapping[str, Any]) -> tuple[dict[str, ColumnValues], list[str]]:
     """Collect arrays of one length; a matrix gives a column for each of its signals."""
     values = {name: np.asarray(value) for name, value in arrays.items()}
-    signals = {name: array for name, array in values.items() if _is_signal(array)}
+    signals = {name: array for name, array in values.items() if is_signal(array)}
     length = _find_length(signals)
     columns: dict[str, ColumnValues] = {}
     for name, array in signals.items():
@@ -155,7 +124,8 @@ def _collect_columns(arrays: Mapping[str, Any]) -> tuple[dict[str, ColumnValues]
     return columns, left_out
 
 
-def _is_signal(array: NDArray[Any]) -> bool:
+def is_signal(array: NDArray[Any]) -> bool:
+    """Whether an array may hold the samples of a signal."""
     return array.size > 1 and array.ndim in (1, 2) and array.dtype.kind in "fiubMU"
 
 
@@ -204,7 +174,7 @@ def read_parquet(path: Path, options: ReadOptions, notes: list[str]) -> Table:
             )
         frame = scan.collect()
     except pl.exceptions.PolarsError as error:
-        raise _build_damage_error("Parquet", error) from None
+        raise build_damage_error("Parquet", error) from None
     columns: dict[str, ColumnValues] = {}
     in_utc, spans = set(), set()
     for series in frame:
@@ -263,24 +233,24 @@ def build_column_table(
     """
     if not columns or not len(next(iter(columns.values()))):
         raise UnreadableFile("the file holds no samples")
+    if options.columns:
+        check_count(options.columns, len(columns), has_times=False)
+    names = list(options.columns or columns)
     headings = [
         Heading(name, "s" if label in spans else unit, _classify_values(values, name))
-        for (name, unit), (label, values) in zip(
-            read_headings(list(columns)), columns.items(), strict=True
-        )
+        for (name, unit), (label, values) in zip(read_headings(names), columns.items(), strict=True)
     ]
-    roles = assign_roles(
-        headings, options.segments, options.sample_time, options.limits.channels, None
-    )
+    roles = assign_roles(headings, options, None)
     rows = np.arange(1, len(next(iter(columns.values()))) + 1)
+    bad_words = Counter[tuple[str, str]]()
     values = tuple(
-        _convert_values(role, column, rows)
+        _convert_values(role, column, rows, bad_words)
         for role, column in zip(roles, columns.values(), strict=True)
     )
     is_utc = any(
         role.role == "time" and label in in_utc for role, label in zip(roles, columns, strict=True)
     )
-    return Table(roles, values, rows, options.sample_time, is_utc)
+    return Table(roles, values, rows, options.sample_time, is_utc, bad_words)
 
 
 def _classify_values(values: ColumnValues, name: str) -> CellKind:
@@ -292,12 +262,17 @@ def _classify_values(values: ColumnValues, name: str) -> CellKind:
     return classify_cells(peek, name)
 
 
-def _convert_values(column: TableColumn, values: ColumnValues, rows: IntArray) -> ColumnValues:
+def _convert_values(
+    column: TableColumn,
+    values: ColumnValues,
+    rows: IntArray,
+    bad_words: Counter[tuple[str, str]],
+) -> ColumnValues:
     """Convert the values of a column to numbers, texts or time stamps, and check them."""
     if values.dtype.kind == "U":
         texts = [str(text).strip() for text in values]
         if holds_numbers(column):
-            return parse_texts(column, texts, rows)
+            return parse_texts(column, texts, rows, bad_words)
         return np.array(texts, dtype=np.str_)
     if values.dtype.kind == "M":
         if column.role == "time" and (missing := np.flatnonzero(np.isnat(values))).size:
@@ -318,7 +293,8 @@ def _convert_values(column: TableColumn, values: ColumnValues, rows: IntArray) -
     return numbers
 
 
-def _build_damage_error(kind: str, error: Exception) -> UnreadableFile:
+def build_damage_error(kind: str, error: Exception) -> UnreadableFile:
+    """Return the error of a file that its library cannot read."""
     reason = " ".join(str(error).split())
     if reason.startswith("Object arrays"):
         reason = "an array holds Python objects; write arrays of numbers"

@@ -9,7 +9,7 @@ Repeats of a measurement are segments, placed one after another on one time axis
 also written as CSV, block by block, and its numbers come back bit for bit.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import chain, islice
 from math import isfinite, nan
 from pathlib import Path
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from service.core.label_text import write_csv
-from service.formats.limits import DEFAULT_LIMITS, UploadLimits
+from service.formats.read_options import DEFAULT_OPTIONS, ReadOptions
 from service.formats.tabular.table_columns import read_lines
 from service.formats.tabular.table_layout import detect_layout
 from service.formats.tabular.table_recordings import build_recording
@@ -26,11 +26,7 @@ from sysid.data.records import Channel, Recording
 
 
 def read_csv(
-    source: Path | str | bytes,
-    *,
-    sample_time: float | None = None,
-    segments: Sequence[str] = (),
-    limits: UploadLimits = DEFAULT_LIMITS,
+    source: Path | str | bytes, options: ReadOptions = DEFAULT_OPTIONS
 ) -> tuple[Recording, tuple[str, ...]]:
     """Read a text file of columns.
 
@@ -38,13 +34,9 @@ def read_csv(
     ----------
     source : Path or str or bytes
         A file's path, or its content.
-    sample_time : float or None
-        Sampling period in s, for a file without a time column.
-    segments : sequence of str
-        Columns of labels, numbers or text. Consecutive rows with equal labels form a segment, and
-        the time may restart with each segment. Segments follow each other on one axis.
-    limits : UploadLimits
-        Those of an MCAP file hold here too: signals, and rows as messages.
+    options : ReadOptions
+        Labels of segments are numbers or text; segments follow each other on one axis. Limits of
+        an MCAP file hold here too: signals, and rows as messages.
 
     Returns
     -------
@@ -58,11 +50,11 @@ def read_csv(
         If the file cannot be used. The error has the row of the file, from 1, and the column.
     """
     notes: list[str] = []
-    with open_text(source, limits, notes) as lines:
-        layout, first = detect_layout(lines, segments, sample_time, limits.channels)
+    with open_text(source, options.limits, notes) as lines:
+        layout, first = detect_layout(lines, options)
         notes += layout.notes
-        table = read_lines(chain(first, lines), layout, notes, limits.messages)
-    return build_recording(table, notes), tuple(notes)
+        table = read_lines(chain(first, lines), layout, notes, options.limits.messages)
+    return build_recording(table, options, notes), tuple(notes)
 
 
 WRITTEN_BLOCK_ROWS = 5000

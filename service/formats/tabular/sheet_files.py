@@ -5,7 +5,7 @@ from pathlib import Path
 
 from python_calamine import CalamineError, CalamineSheet, CalamineWorkbook
 
-from service.formats.limits import ReadOptions
+from service.formats.read_options import ReadOptions
 from service.formats.tabular.table_columns import Table, read_rows
 from service.formats.tabular.table_layout import TableLayout, detect_sheet_layout
 from sysid.core.errors import UnreadableFile
@@ -46,10 +46,7 @@ def read_sheets(path: Path, options: ReadOptions, notes: list[str]) -> Table:
 def _find_table(sheet: CalamineSheet, options: ReadOptions) -> tuple[list[list[str]], TableLayout]:
     rows = [[_write_cell(cell) for cell in row] for row in sheet.to_python(skip_empty_area=False)]
     rows = _cut_empty_columns(rows)
-    layout = detect_sheet_layout(
-        rows, options.segments, options.sample_time, options.limits.channels
-    )
-    return rows, layout
+    return rows, detect_sheet_layout(rows, options)
 
 
 def _cut_empty_columns(rows: list[list[str]]) -> list[list[str]]:

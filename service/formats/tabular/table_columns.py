@@ -1,17 +1,25 @@
 """Read the body of a table of texts: fast for clean blocks, field by field to locate a fault."""
 
 import csv
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import islice
 from math import isinf, isnan, nan
+from shlex import quote
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.core.label_text import unescape_formula
 from service.formats.limits import DEFAULT_LIMITS
-from service.formats.tabular.cells import FLAGS, MISSING, classify_cell
+from service.formats.tabular.cells import (
+    BAD_WORDS,
+    FLAGS,
+    MISSING,
+    begins_like_number,
+    classify_cell,
+)
 from service.formats.tabular.table_layout import (
     MAX_FOOTER_ROWS,
     TableColumn,
@@ -43,6 +51,8 @@ class Table:
         Sampling period in s, if it was given.
     is_utc : bool
         Whether the time stamps of the times are in UTC; else they are local.
+    bad_words : mapping
+        How often each column has each word that marks a bad value.
     """
 
     columns: tuple[TableColumn, ...]
@@ -50,6 +60,7 @@ class Table:
     rows: IntArray
     sample_time: float | None = None
     is_utc: bool = False
+    bad_words: Mapping[tuple[str, str], int] = field(default_factory=dict)
 
     def find_values(self, name: str) -> ColumnValues:
         """Return the values of a column."""
@@ -91,6 +102,7 @@ def read_rows(
 ) -> Table:
     """Read the rows of the body, which are split into fields; raises as `read_lines`."""
     blocks = []
+    bad_words = Counter[tuple[str, str]]()
     comments, sign = 0, "." if layout.separator == "," else ""
     for fields, numbers, skipped in _iterate_blocks(rows, layout, notes):
         comments += skipped
@@ -99,7 +111,12 @@ def read_rows(
         if fields:
             fit = _fit_rows(fields, layout, numbers)
             sign = sign or _find_decimal_sign(fit, layout)
-            blocks.append((_parse_block(fit, layout, numbers, sign == ","), numbers))
+            parse = _parse_decimal_comma if sign == "," else _parse_decimal_point
+            parsed = [
+                _parse_column(column, cells, parse, numbers, bad_words)
+                for column, cells in zip(layout.columns, fit, strict=True)
+            ]
+            blocks.append((parsed, numbers))
     if not blocks:
         raise UnreadableFile("there are no rows below the header")
     if comments:
@@ -110,7 +127,7 @@ def read_rows(
         np.concatenate([block[i] for block, _ in blocks]) for i in range(len(layout.columns))
     )
     rows_of_samples = np.concatenate([numbers for _, numbers in blocks])
-    return Table(layout.columns, values, rows_of_samples, layout.sample_time)
+    return Table(layout.columns, values, rows_of_samples, layout.sample_time, bad_words=bad_words)
 
 
 def _iterate_blocks(
@@ -182,16 +199,6 @@ def _find_decimal_sign(texts: Sequence[tuple[str, ...]], layout: TableLayout) ->
     return next(signs, "")
 
 
-def _parse_block(
-    texts: Sequence[tuple[str, ...]], layout: TableLayout, numbers: IntArray, has_commas: bool
-) -> list[ColumnValues]:
-    convert = _parse_decimal_comma if has_commas else _parse_decimal_point
-    return [
-        _parse_column(column, cells, convert, numbers)
-        for column, cells in zip(layout.columns, texts, strict=True)
-    ]
-
-
 def _pad_row(row: list[str], layout: TableLayout, number: int) -> list[str]:
     """Fit a row whose last, nameless column is left out, or is empty; refuse any other."""
     width = len(layout.columns)
@@ -207,9 +214,20 @@ def _pad_row(row: list[str], layout: TableLayout, number: int) -> list[str]:
     )
 
 
-def parse_texts(column: TableColumn, texts: Sequence[str], numbers: IntArray) -> ColumnValues:
-    """Parse a column of texts with decimal points; raises as `read_lines`."""
-    return _parse_column(column, texts, _parse_decimal_point, numbers)
+def parse_texts(
+    column: TableColumn,
+    texts: Sequence[str],
+    numbers: IntArray,
+    bad_words: Counter[tuple[str, str]],
+) -> ColumnValues:
+    """Parse a column of texts with decimal points, and count its words of bad values.
+
+    Raises
+    ------
+    UnreadableFile
+        As `read_lines`.
+    """
+    return _parse_column(column, texts, _parse_decimal_point, numbers, bad_words)
 
 
 def _parse_column(
@@ -217,6 +235,7 @@ def _parse_column(
     texts: Sequence[str],
     convert: Callable[[str], float],
     numbers: IntArray,
+    bad_words: Counter[tuple[str, str]],
 ) -> ColumnValues:
     if column.role == "label":
         return np.array([unescape_formula(text.strip()) for text in texts], dtype=np.str_)
@@ -230,7 +249,7 @@ def _parse_column(
         pass  # parsed field by field below, to name the invalid field or to accept an empty one
     return np.array(
         [
-            _parse_field(column, text, convert, int(number))
+            _parse_field(column, text, convert, int(number), bad_words)
             for text, number in zip(texts, numbers, strict=True)
         ]
     )
@@ -244,9 +263,16 @@ def holds_numbers(column: TableColumn) -> bool:
 
 
 def _parse_field(
-    column: TableColumn, text: str, convert: Callable[[str], float], row: int
+    column: TableColumn,
+    text: str,
+    convert: Callable[[str], float],
+    row: int,
+    bad_words: Counter[tuple[str, str]],
 ) -> float:
     word = text.strip().lower()
+    if column.role != "time" and (word in BAD_WORDS or word in column.bad_words):
+        bad_words[column.name, text.strip()] += 1
+        return nan
     try:
         value = nan if word in MISSING else FLAGS[word] if word in FLAGS else convert(text)
     except ValueError:
@@ -306,6 +332,9 @@ def _suggest_cause(text: str, column: TableColumn, convert: Callable[[str], floa
         )
     if column.role == "time":
         return Advice("times are in seconds, or are date stamps in all rows")
+    if not begins_like_number(text):
+        word = text.strip()
+        return Advice("if it marks a bad value, give ", "missing", f"={quote(word)}")
     return Advice(
         "leave the field empty if the value is missing; if the column is a label, name it in ",
         "segments",

@@ -15,10 +15,13 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Final, Literal, NamedTuple, TypeVar
 
+import numpy as np
+
 from service.core.label_text import unescape_formula
-from service.formats.advice import GIVE_PERIOD, build_period_error
-from service.formats.limits import DEFAULT_LIMITS
+from service.formats.advice import GIVE_PERIOD, name_columns
+from service.formats.read_options import ReadOptions
 from service.formats.tabular.cells import begins_like_number, classify_cell, classify_column
+from service.formats.tabular.long_headings import find_long_places
 from sysid.core.errors import Advice, UnreadableFile, suggest_name
 from sysid.data.table_rules import (
     STAMP_KINDS,
@@ -51,18 +54,27 @@ _MAX_LISTED = 8  # columns named in a message
 _UNIT_FIELD = re.compile(r"^(\[.*\]|\(.*\))$")
 
 _T = TypeVar("_T")
-ColumnRole = Literal["time", "date", "label", "value", "nameless", "text"]
-"""``date`` completes a time of day; ``nameless`` and ``text`` are left out of the recording."""
+ColumnRole = Literal[
+    "time", "date", "label", "value", "nameless", "text", "unused", "key", "entry", "unit"
+]
+"""``date`` completes a time of day; ``nameless``, ``text`` and ``unused`` are no signals.
+
+In a long table ``key`` names the signal of a row, ``entry`` has its value and ``unit`` its unit.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class TableColumn:
-    """One column: its name without the unit, its unit, what it holds and its role."""
+    """One column: its name without the unit, its unit, what it holds and its role.
+
+    `bad_words` are those by which the user's file marks a bad value, in small letters.
+    """
 
     name: str
     unit: str
     kind: CellKind
     role: ColumnRole
+    bad_words: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,12 +126,7 @@ class _DataBlock(NamedTuple):
         return any(len(row.fields) == self.width for row in self.before)
 
 
-def detect_layout(
-    lines: Iterator[str],
-    segments: Sequence[str],
-    sample_time: float | None,
-    max_channels: int = DEFAULT_LIMITS.channels,
-) -> tuple[TableLayout, list[str]]:
+def detect_layout(lines: Iterator[str], options: ReadOptions) -> tuple[TableLayout, list[str]]:
     """Detect the layout of a text, and return the first lines, which were read for it.
 
     Raises
@@ -132,42 +139,37 @@ def detect_layout(
     for first in _peek(lines):
         if not any(map(str.strip, first)):
             continue
-        blocks = list(_find_text_blocks(first, len(segments), max_channels))
+        blocks = list(_find_text_blocks(first, options))
         if any(block.data for block in blocks):
             break
     if not first:
         raise UnreadableFile("the file is empty; need a header and rows, such as t,u,y")
     if not any(map(str.strip, first)):
         raise UnreadableFile("the first rows are empty; need a header such as t,u,y", row=1)
-    block = _choose_block(blocks, first)
-    return _build_layout(block, segments, sample_time, max_channels), first
+    block = _choose_block(blocks, first, len(options.columns))
+    return _build_layout(block, options), first
 
 
-def _find_text_blocks(lines: Sequence[str], labels: int, max_channels: int) -> Iterator[_DataBlock]:
+def _find_text_blocks(lines: Sequence[str], options: ReadOptions) -> Iterator[_DataBlock]:
     """Find the data under each separator."""
     hint = re.match(r'"?sep=(.)"?\s*$', lines[0], re.IGNORECASE)
     for separator in (hint[1],) if hint else SEPARATORS:
         if hint or separator == " " or any(separator in line for line in lines):
             rows = _split_lines(lines[1:] if hint else lines, separator, int(bool(hint)))
-            _check_width(rows, labels, max_channels)
+            _check_width(rows, options)
             yield _find_block(rows, separator)
 
 
-def detect_sheet_layout(
-    rows: Iterable[list[str]],
-    segments: Sequence[str],
-    sample_time: float | None,
-    max_channels: int = DEFAULT_LIMITS.channels,
-) -> TableLayout:
+def detect_sheet_layout(rows: Iterable[list[str]], options: ReadOptions) -> TableLayout:
     """Detect the layout of rows that are split already; raises as `detect_layout`."""
     block = _DataBlock("", [], [])
     for first in _peek(iter(rows)):
         numbered = [_Row(place, fields) for place, fields in enumerate(first)]
-        _check_width(numbered, len(segments), max_channels)
+        _check_width(numbered, options)
         block = _find_block(numbered, "")
         if block.data:
             break
-    return _build_layout(block, segments, sample_time, max_channels)
+    return _build_layout(block, options)
 
 
 def _peek(rows: Iterator[_T]) -> Iterator[list[_T]]:
@@ -213,9 +215,10 @@ def _join_units(fields: list[str]) -> list[str]:
     return joined
 
 
-def _check_width(rows: Sequence[_Row], labels: int, max_channels: int) -> None:
+def _check_width(rows: Sequence[_Row], options: ReadOptions) -> None:
     """Refuse a table that is too wide before its cells are looked at."""
-    if rows and len(rows[0].fields) - labels - 1 > max_channels:
+    max_channels = options.limits.channels
+    if rows and len(rows[0].fields) - len(options.segments) - 1 > max_channels:
         raise UnreadableFile(
             f"the header has {len(rows[0].fields)} columns; at most {max_channels} signals are "
             "read",
@@ -284,10 +287,10 @@ def _begins_with_word(fields: Sequence[str]) -> bool:
 
 
 def _is_data(fields: Sequence[str]) -> bool:
-    """Whether a row is one of data: its first field is, or most of its fields are."""
+    """Whether a row is one of data: its first field is, most are, or one is a time stamp."""
     kinds = [kind for kind in map(classify_cell, fields) if kind != "empty"]
     count = sum(kind != "text" for kind in kinds)
-    return count > 0 and (kinds[0] != "text" or 2 * count > len(kinds))
+    return count > 0 and (kinds[0] != "text" or 2 * count > len(kinds) or "stamp" in kinds)
 
 
 def _is_header_of(fields: Sequence[str], below: Sequence[str]) -> bool:
@@ -296,11 +299,17 @@ def _is_header_of(fields: Sequence[str], below: Sequence[str]) -> bool:
     return any(kind == "text" and other not in ("text", "empty") for kind, other in kinds)
 
 
-def _choose_block(blocks: Sequence[_DataBlock], lines: Sequence[str]) -> _DataBlock:
-    """Choose the separator under which the data have a header, then the longest and the widest."""
+def _choose_block(blocks: Sequence[_DataBlock], lines: Sequence[str], named: int) -> _DataBlock:
+    """Choose the separator under which the data have a header, then the longest and the widest.
+
+    If the user named columns, the one comes first under which there are so many.
+    """
     found = [block for block in blocks if block.data and block.width > 1]
     if found:
-        return max(found, key=lambda block: (block.has_header, len(block.data), block.width))
+        return max(
+            found,
+            key=lambda one: (one.width == named, one.has_header, len(one.data), one.width),
+        )
     single = next((block for block in blocks if block.data), None)
     if single is not None:
         return single._replace(separator=single.separator.strip(" ") or ",")
@@ -312,22 +321,29 @@ def _choose_block(blocks: Sequence[_DataBlock], lines: Sequence[str]) -> _DataBl
     return blocks[0]
 
 
-def _build_layout(
-    block: _DataBlock, segments: Sequence[str], sample_time: float | None, max_channels: int
-) -> TableLayout:
+def _build_layout(block: _DataBlock, options: ReadOptions) -> TableLayout:
     if not block.data:
         raise _build_no_table_error(block)
-    header, units, names = _find_header(block)
     cells = [row.fields for row in block.data]
-    names, cells = _align_header(names, cells)
+    if options.columns:
+        header, names = block.data[0], list(options.columns)
+        units = list[str]()
+        if len(names) == block.width - 1 and not any(row[-1].strip() for row in cells):
+            names.append("")  # each row ends with a separator
+        check_count(names, block.width, _may_be_times(cells))
+    else:
+        header, units, names = _find_header(block)
+        names, cells = _align_header(names, cells)
     headings = [
         Heading(name, unit, classify_cells([row[i] for row in cells], name))
         for i, (name, unit) in enumerate(read_headings(names, units))
     ]
     row = header.place + 1
-    if len(headings) == 1 and (sample_time is None or _is_number(names[0])):
+    if options.columns:
+        return _build_named_layout(block, headings, options)
+    if len(headings) == 1 and (options.sample_time is None or _is_number(names[0])):
         raise _build_narrow_error(names[0])
-    columns = assign_roles(headings, segments, sample_time, max_channels, row)
+    columns = assign_roles(headings, options, row)
     notes = []
     preamble = [r for r in block.before if r.place < header.place and not is_comment(r.fields)]
     if preamble:
@@ -335,7 +351,46 @@ def _build_layout(
     if units:
         notes.append(f"row {row + 1} was read as the units of the columns")
     skipped = block.data[0].place if block.data else header.place + 1
-    return TableLayout(columns, block.separator, row, skipped, sample_time, tuple(notes))
+    return TableLayout(columns, block.separator, row, skipped, options.sample_time, tuple(notes))
+
+
+def _build_named_layout(
+    block: _DataBlock, headings: Sequence[Heading], options: ReadOptions
+) -> TableLayout:
+    """Build the layout of data below no header, whose columns the user named."""
+    first = block.data[0].place
+    columns = assign_roles(headings, options, None)
+    lines = [row for row in block.before if not is_comment(row.fields)]
+    notes = (f"the lines before row {first + 1} were skipped",) if lines else ()
+    return TableLayout(columns, block.separator, first, first, options.sample_time, notes)
+
+
+def check_count(names: Sequence[str], count: int, has_times: bool) -> None:
+    """Check that the user named each column.
+
+    Raises
+    ------
+    UnreadableFile
+        If there are more or fewer names.
+    """
+    if len(names) != count:
+        advice = name_columns(count, has_times=has_times)
+        raise UnreadableFile(
+            f"the table has {count} columns, and {len(names)} names are given; ",
+            advice._replace(after=f"{advice.after}. An empty name leaves a column out"),
+        )
+
+
+def _may_be_times(cells: Sequence[Sequence[str]]) -> bool:
+    """Whether the first column may be the time: it holds stamps, or only increases."""
+    texts = [row[0] for row in cells]
+    if classify_column(texts) in STAMP_KINDS:
+        return True
+    try:
+        times = np.array([float(text.replace(",", ".")) for text in texts])
+    except ValueError:
+        return False
+    return len(texts) > 1 and bool(np.all(np.diff(times) > 0))
 
 
 def classify_cells(cells: Sequence[str], name: str) -> CellKind:
@@ -348,7 +403,8 @@ def classify_cells(cells: Sequence[str], name: str) -> CellKind:
 def _find_header(block: _DataBlock) -> tuple[_Row, list[str], list[str]]:
     """Find the header before the data, the row of units below it, and the names."""
     rows = [row for row in block.before if not is_comment(row.fields)]
-    fit = [row for row in rows if abs(len(row.fields) - block.width) <= 1] or rows[-1:]
+    fit = [row for row in rows if abs(len(row.fields) - block.width) <= 1]
+    fit = fit or [row for row in rows[-1:] if len(row.fields) > 1]
     same = [row for row in fit if len(row.fields) == block.width] or fit
     if same:
         last = same[-1]
@@ -364,7 +420,9 @@ def _find_header(block: _DataBlock) -> tuple[_Row, list[str], list[str]]:
     first = block.data[0]
     if block.width == 1:
         raise _build_narrow_error(first.fields[0])
-    raise _build_header_error(first.place + 1)
+    raise _build_header_error(
+        first.place + 1, block.width, _may_be_times([row.fields for row in block.data])
+    )
 
 
 def _check_widths(rows: Sequence[_Row], last: _Row, width: int) -> None:
@@ -383,10 +441,10 @@ def _check_widths(rows: Sequence[_Row], last: _Row, width: int) -> None:
             )
 
 
-def _build_header_error(row: int | None) -> UnreadableFile:
+def _build_header_error(row: int | None, count: int, has_times: bool) -> UnreadableFile:
     return UnreadableFile(
-        "the first row holds numbers; need a header that names the columns: put a line such as "
-        "t,u,y above it",
+        "the first row holds numbers, so the file has no header; ",
+        name_columns(count, has_times=has_times),
         row=row,
     )
 
@@ -476,11 +534,7 @@ def _is_number(field: str) -> bool:
 
 
 def assign_roles(
-    headings: Sequence[Heading],
-    segments: Sequence[str],
-    sample_time: float | None,
-    max_channels: int = DEFAULT_LIMITS.channels,
-    row: int | None = 1,
+    headings: Sequence[Heading], options: ReadOptions, row: int | None = 1
 ) -> tuple[TableColumn, ...]:
     """Give each column its role.
 
@@ -490,22 +544,25 @@ def assign_roles(
         If a name is missing or occurs twice, a label column is missing, or there is no signal or no
         time. Also if the time is given twice.
     """
+    bad_words = frozenset(word.lower() for word in options.missing)
     named = [
-        TableColumn(*heading, role="nameless" if is_nameless(heading) else "value")
+        TableColumn(*heading, _find_role(heading, is_named=bool(options.columns)), bad_words)
         for heading in headings
     ]
-    _check_names(named, row)
+    _check_names(named, options, row)
     columns = [
-        replace(column, role="label" if column.name in segments else column.role)
+        replace(column, role="label" if column.name in options.segments else column.role)
         for column in named
     ]
     names = [column.name for column in columns]
-    for label in segments:
+    for label in options.segments:
         if label not in names:
             raise UnreadableFile(
                 f"there is no label column {label!r}{suggest_name(label, names)}", row=row
             )
-    columns = _assign_time(columns, sample_time, row)
+    columns = _assign_time(columns, options.sample_time, row)
+    if options.sample_time is None:
+        columns = _assign_long_roles(columns)
     columns = [
         replace(c, role="text") if c.role == "value" and c.kind in ("text", *STAMP_KINDS) else c
         for c in columns
@@ -514,14 +571,39 @@ def assign_roles(
         if column.role == "nameless" and column.kind not in ("empty", "count"):
             raise build_nameless_error(number, row)
     signals = sum(column.role == "value" for column in columns)
-    if signals == 0 and not any(column.role == "text" for column in columns):
+    if signals == 0 and not any(column.role in ("text", "entry") for column in columns):
         raise UnreadableFile("there is no signal: every column is time or a label")
-    if signals > max_channels:
+    if signals > options.limits.channels:
         raise UnreadableFile(
-            f"the header has {len(headings)} columns; at most {max_channels} signals are read",
+            f"the header has {len(headings)} columns; at most {options.limits.channels} signals "
+            "are read",
             row=row,
         )
     return tuple(columns)
+
+
+def _assign_long_roles(columns: Sequence[TableColumn]) -> list[TableColumn]:
+    """Give the columns of a long table their roles, if names of signals stand below a heading."""
+    places = find_long_places(
+        [
+            Heading(column.name, column.unit, column.kind) if column.role == "value" else None
+            for column in columns
+        ]
+    )
+    roles = list(columns)
+    if places is not None:
+        roles[places.key] = replace(columns[places.key], role="key")
+        roles[places.entry] = replace(columns[places.entry], role="entry")
+        if places.unit is not None:
+            roles[places.unit] = replace(columns[places.unit], role="unit")
+    return roles
+
+
+def _find_role(heading: Heading, *, is_named: bool) -> ColumnRole:
+    """Find the first role of a column; one that the user gave no name is unused."""
+    if is_named:
+        return "value" if heading.name else "unused"
+    return "nameless" if is_nameless(heading) else "value"
 
 
 def build_nameless_error(number: int, row: int | None = 1) -> UnreadableFile:
@@ -529,9 +611,9 @@ def build_nameless_error(number: int, row: int | None = 1) -> UnreadableFile:
     return UnreadableFile(f"column {number} of the header has no name", row=row)
 
 
-def _check_names(columns: Sequence[TableColumn], row: int | None) -> None:
-    if all(_is_number(column.name) for column in columns):
-        raise _build_header_error(row)
+def _check_names(columns: Sequence[TableColumn], options: ReadOptions, row: int | None) -> None:
+    if not options.columns and all(_is_number(column.name) for column in columns):
+        raise _build_header_error(row, len(columns), has_times=False)
     seen: set[str] = set()
     for column in columns:
         if column.name in seen and column.name:
@@ -565,8 +647,6 @@ def _assign_time(
         ],
         has_period=sample_time is not None,
     )
-    if sample_time is not None and not 0 < sample_time < float("inf"):
-        raise build_period_error(sample_time)
     if time is None:
         if sample_time is None:
             raise UnreadableFile(

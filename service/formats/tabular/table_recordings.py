@@ -1,13 +1,26 @@
 """Make a recording of the columns of a table: times, segments, channels, and notes."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import floor, log10
+from shlex import quote
 
 import numpy as np
 
 from service.formats.advice import GIVE_PERIOD
+from service.formats.read_options import ReadOptions
+from service.formats.tabular.bad_values import apply_status_columns, mask_markers
 from service.formats.tabular.cells import begins_like_number, classify_cell
+from service.formats.tabular.exclusions import KeptRows, exclude_ranges
+from service.formats.tabular.long_tables import (
+    TableSignal,
+    find_long_table,
+    has_sparse_rows,
+    list_signals,
+    list_wide_signals,
+    sort_rows,
+)
 from service.formats.tabular.table_columns import (
     ColumnValues,
     Table,
@@ -72,7 +85,7 @@ def _round_up_step(longest: float) -> float:
     return next(step for m in (1, 2, 5, 10, 20) if (step := m * decade) > longest)
 
 
-def build_recording(table: Table, notes: list[str]) -> Recording:
+def build_recording(table: Table, options: ReadOptions, notes: list[str]) -> Recording:
     """Build the recording of a table; each guess and each finding becomes a note.
 
     Raises
@@ -80,31 +93,56 @@ def build_recording(table: Table, notes: list[str]) -> Recording:
     UnreadableFile
         If the columns cannot be used, with the row and the column.
     """
-    table = _name_signals(table, notes)
-    _check_left_out(table, notes)
+    table = apply_status_columns(_name_signals(table, notes), notes)
     labels = [column.name for column in table.columns if column.role == "label"]
     starts = _find_segment_starts(table, labels)
     clock = _build_times(table, starts, notes)
-    if not labels and table.sample_time is None:
+    long = find_long_table(table, clock.seconds, starts)
+    if long is not None:
+        long, clock = sort_rows(long, clock, starts)
+        table = long.table
+    has_own_rows = long is not None or has_sparse_rows(table, clock.seconds, starts)
+    if not has_own_rows and not labels and table.sample_time is None:
         table, clock, starts = _repair_order(table, clock, notes)
-    _check_order(clock.seconds, starts, table, notes)
+    _check_left_out(table, notes)
+    if not has_own_rows or (long is None and np.any(_find_falls(clock.seconds, starts))):
+        _check_order(clock.seconds, starts, table, notes)
+    if options.exclude:
+        kept = exclude_ranges(KeptRows(table, clock.seconds, starts), options.exclude, notes)
+        table, starts, clock = kept.table, kept.starts, clock._replace(seconds=kept.times)
+        long = None if long is None else replace(long, table=table)
+    signals = [] if long is None else list_signals(long, notes)
+    signals += list_wide_signals(table, clock.seconds, starts, notes, is_sparse=has_own_rows)
     times, spans = _build_segments(table, labels, clock.seconds, starts, notes)
+    channels = _build_channels(signals, table, times, clock.unit, options, notes)
+    return Recording(channels, spans, clock.started_at)
+
+
+def _build_channels(
+    signals: Sequence[TableSignal],
+    table: Table,
+    times: FloatArray,
+    time_unit: str,
+    options: ReadOptions,
+    notes: list[str],
+) -> tuple[Channel, ...]:
+    """Build the channels of signals, without markers of bad data; tell what is missing."""
     channels, empty = [], []
-    for column, values in zip(table.columns, table.values, strict=True):
-        if column.role != "value":
-            continue
-        numbers = np.asarray(values, dtype=np.float64)
+    for signal in signals:
+        numbers = mask_markers(signal.name, signal.values, options.missing, notes)
         if np.isnan(numbers).all():
-            empty.append(column.name)
+            empty.append(signal.name)
             continue
-        if column.kind == "flag":
-            notes.append(f"channel {column.name!r}: true and false were read as 1 and 0")
-        channels.append(Channel(column.name, times, numbers, column.unit or "1"))
+        if signal.kind == "flag":
+            notes.append(f"channel {signal.name!r}: true and false were read as 1 and 0")
+        _report_bad_words(signal.name, table, notes)
+        own = times[signal.rows]
+        channels.append(Channel(signal.name, own, numbers, signal.unit or "1", time_unit=time_unit))
     if not channels:
         raise UnreadableFile("every value is missing; leave the column out", column=empty[0])
     if empty:
         notes.append(f"columns without any value were left out: {', '.join(empty)}")
-    return Recording(tuple(channels), spans, clock.started_at)
+    return tuple(channels)
 
 
 def _name_signals(table: Table, notes: list[str]) -> Table:
@@ -117,7 +155,7 @@ def _name_signals(table: Table, notes: list[str]) -> Table:
         if column.role == "nameless" and any(texts) and not counts_rows(texts):
             columns[place] = replace(column, role="value", kind="number")
             if values[place].dtype.kind == "U":
-                values[place] = parse_texts(columns[place], texts, table.rows)
+                values[place] = parse_texts(columns[place], texts, table.rows, Counter())
         if columns[place].role == "value":
             notes.append(f"column {column.name!r} does not count the rows, so it is a signal")
     return replace(table, columns=tuple(columns), values=tuple(values))
@@ -311,7 +349,10 @@ def _check_increasing(times: FloatArray, starts: IntArray, table: Table, time: T
     several = "If the file has several measurements, "
     hint = f"Remove the row if it is a fault of the logger. {several}"
     advice = Advice("name the columns that number them with ", "segments", ".")
-    if is_stamp:
+    label = _find_label(table, times)
+    if label:
+        hint, advice = several, Advice("divide it by ", "segments", f"={quote(label)}.")
+    elif is_stamp:
         hint, advice = "If the stamps are too coarse, ", GIVE_PERIOD
     elif before == after:
         hint = f"{several}give the columns that number them as segments. "
@@ -326,8 +367,33 @@ def _check_increasing(times: FloatArray, starts: IntArray, table: Table, time: T
     )
 
 
+def _find_label(table: Table, times: FloatArray) -> str:
+    """Find the column that changes where the times go back, and nowhere else; empty if none."""
+    resets = np.diff(times) < 0
+    if not resets.any():
+        return ""
+    for column, values in zip(table.columns, table.values, strict=True):
+        if column.role in ("value", "text") and np.array_equal(values[1:] != values[:-1], resets):
+            return column.name
+    return ""
+
+
+def _find_falls(times: FloatArray, starts: IntArray) -> BoolArray:
+    """Find where times go back inside a segment."""
+    falls = np.diff(times) < 0
+    falls[starts[1:] - 1] = False
+    return falls
+
+
 def _report_repeated_times(times: FloatArray, starts: IntArray, notes: list[str]) -> None:
     shared = np.diff(times) == 0
     shared[starts[1:] - 1] = False
     if count := int(np.count_nonzero(shared)):
         notes.append(f"{count} samples have the same time as the previous sample of their segment")
+
+
+def _report_bad_words(name: str, table: Table, notes: list[str]) -> None:
+    found = {word: count for (column, word), count in table.bad_words.items() if column == name}
+    if found:
+        listed = ", ".join(f"{word!r} ({count})" for word, count in found.items())
+        notes.append(f"channel {name!r}: words that mark bad values were read as missing: {listed}")

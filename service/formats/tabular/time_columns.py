@@ -69,6 +69,8 @@ def _read_clock(match: re.Match[str]) -> float:
 
 
 def _describe_period(times: FloatArray) -> str:
+    if np.any(np.diff(times) < 0):
+        return "not in order"
     sampling = measure_sampling(times)
     if sampling.samples < 2:
         return "one sample"

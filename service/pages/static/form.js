@@ -115,6 +115,8 @@ async function upload() {
     const options = new URLSearchParams({ name: file.name });
     const period = readNumber('upload-period');
     if (period !== null) options.set('sample_time', period);
+    const columns = field('upload-columns').value.trim();
+    if (columns) options.set('columns', columns);
     const stored = await storeFile(() => ask(address(`/v1/datasets?${options}`), {
       method: 'POST', headers: { 'Content-Type': 'application/octet-stream' }, body: file,
     }));
@@ -124,9 +126,18 @@ async function upload() {
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
     const message = error.message.replace(/\bsample_time\b/g, 'the field "sampling period"');
-    form.querySelector('[data-fault="/datasets"]').textContent = message;
+    form.querySelector('[data-fault="/datasets"]').textContent = askForColumns(message);
     showUpload('');
   }
+}
+
+/** Ask for names of columns, with those that the message proposes; return the message for the page. */
+function askForColumns(message) {
+  const proposal = /\bcolumns=([^\s.…]*[^\s.…,])/.exec(message);
+  if (!proposal) return message;
+  field('upload-columns').value = proposal[1];
+  field('upload-columns').focus();
+  return message.replace('columns=', 'the field "names of its columns": ');
 }
 
 /** Ask for a model of the list or for the check of a text. Only the last answer is shown. */
@@ -342,7 +353,7 @@ field('dataset').addEventListener('change', withFaults(() => {
   dropUpload();
   return showDataset();
 }));
-for (const name of ['upload', 'upload-period']) field(name).addEventListener('change', withFaults(upload));
+for (const name of ['upload', 'upload-period', 'upload-columns']) field(name).addEventListener('change', withFaults(upload));
 document.getElementById('channels').addEventListener('change', proposeBounds);
 for (const kind of ['dragover', 'drop'])
   document.addEventListener(kind, (event) => {

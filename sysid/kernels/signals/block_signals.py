@@ -106,13 +106,13 @@ class ParameterEnvironment(Environment):
 
 @dataclass(frozen=True, slots=True)
 class StartEnvironment(ParameterEnvironment):
-    """Environment of an initial value: parameters and the inputs' values at the start."""
+    """Environment of an initial value: parameters, inputs and earlier states at the start."""
 
-    first_inputs: dict[str, IrValue]
+    first_values: dict[str, IrValue]
 
     def emit_past_value(self, past: PastValue) -> IrValue:
-        """Emit the value of an input at the start."""
-        return self.first_inputs[past.name]
+        """Emit the value of an input or a state at the start."""
+        return self.first_values[past.name]
 
 
 @dataclass(frozen=True, slots=True)

@@ -137,6 +137,7 @@ def _list_bodies(method: str, path: str, victim: Side) -> list[dict[str, Any]]:
             {"model": victim.model, **simulated, "inputs": {"u": {"kind": "step"}}},
             {"model": "fopdt", **simulated, "inputs": {"u": dataset_input}},
         ],
+        "/v1/datasets:join": [{"datasets": [victim.dataset, victim.dataset]}],
         "/v1/datasets/{dataset_id}:derive": [{"steps": [{"trim": {"stop": 10}}]}],
         "/v1/runs/{run_id}:simulate": [
             {"inputs": {"u": {"kind": "step"}}, "samples": 200, "sample_time": 0.1, "store": True}

@@ -377,7 +377,7 @@ def test_a_recording_that_is_not_there_or_not_readable_is_one_line(tmp_path: Pat
 @pytest.mark.parametrize(
     ("content", "told"),
     [
-        (b'{"t": [0, 1]}', "the file is JSON, which is not read"),
+        (b'{"t": [0, 1]}', "the JSON holds no list of records"),
         (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "the spreadsheet cannot be opened"),
         (b"t,u\n0,1\n1,a\n", "row 3, column 'u': found 'a'"),
         (b"u,y\n0,1\n1,2\n", "row 1: there is no time column; found u, y"),

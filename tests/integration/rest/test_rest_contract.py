@@ -58,6 +58,9 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
 
         dataset = post("/v1/datasets:simulate", "simulate_dataset")
         post(f"/v1/datasets/{dataset}:derive", "derive_dataset")
+        room = "t,room [degC]\n0.5,20\n1.5,20.5\n3.5,21\n"
+        other = f"/v1/datasets?name={examples.OTHER_LOGGER}"
+        assert server.post(other, content=room, headers={"content-type": "text/csv"}).is_success
         batch = post("/v1/recipes/reidentify", "submit_reidentification", algorithm=SMALL)
         twice = {"axes": [{"path": "/seed", "values": [1, 2]}]}
         pair = post("/v1/jobs", "submit_job", algorithm=SMALL, sweep=twice)

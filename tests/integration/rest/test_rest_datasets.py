@@ -46,6 +46,38 @@ def test_the_same_bytes_read_otherwise_are_another_dataset(server: TestClient) -
     assert not any("already stored" in warning for warning in stored[0].json()["warnings"])
 
 
+def test_recordings_of_two_loggers_are_joined(server: TestClient) -> None:
+    rows = {
+        "supply": "time,supply\n2026-03-14T08:00:00Z,40\n2026-03-14T08:00:10Z,45\n",
+        "room": "time,room\n2026-03-14T08:00:02Z,20\n2026-03-14T08:00:08Z,21\n",
+    }
+    for name, text in rows.items():
+        server.post(f"/v1/datasets?name={name}", content=text.encode(), headers=CSV)
+    body = {"datasets": ["supply", "room"], "name": "heating"}
+    answer = server.post("/v1/datasets:join", json=body)
+    assert answer.status_code == 201
+    joined = answer.json()
+    assert [(one["name"], one["start"]) for one in joined["channels"]] == [
+        ("supply", 0.0),
+        ("room", 2.0),
+    ]
+    assert joined["started_at"] == "2026-03-14T08:00:00+00:00"
+    assert "clocks are joined: supply begins first, room begins 2 s later" in joined["warnings"]
+    assert server.post("/v1/datasets:join", json=body).status_code == 200
+    edges = server.get(f"/v1/datasets/{joined['id']}/lineage").json()["edges"]
+    assert len([edge for edge in edges if edge["child"] == joined["id"]]) == 2
+    assert server.post("/v1/datasets:join", json={"datasets": ["supply"]}).status_code == 422
+    missing = server.post("/v1/datasets:join", json={"datasets": ["supply", "attic"]})
+    assert missing.status_code == 404
+    pair = [
+        server.post(f"/v1/datasets?name={name}", content=recording(length), headers=CSV)
+        for name, length in (("a", 100), ("b", 120))
+    ]
+    same = server.post("/v1/datasets:join", json={"datasets": [one.json()["id"] for one in pair]})
+    assert same.status_code == 422
+    assert "so they are experiments. Fit them jointly" in same.text
+
+
 def test_the_same_steps_on_two_datasets_give_two(server: TestClient, dataset: str) -> None:
     other = server.post("/v1/datasets?name=b", content=recording(120), headers=CSV).json()["id"]
     steps = {"steps": [{"trim": {"start": 0, "stop": 5}}]}

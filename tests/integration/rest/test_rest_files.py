@@ -90,7 +90,7 @@ def test_the_clock_of_a_recording_is_kept_and_told(server: TestClient) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b'{"t": [0, 1]}', "the file is JSON, which is not read; write"),
+        (b'{"t": [0, 1]}', "the JSON holds no list of records. Write"),
         (b"u,y\n1,2\n2,3\n", "give the sampling period with sample_time"),
         (b"\x89HDF\r\n\x1a\n\0", "HDF5"),
         (write_npz(u=INPUT, y=OUTPUT), "there is no time column; found u, y"),

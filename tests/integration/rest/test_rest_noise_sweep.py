@@ -376,3 +376,61 @@ def test_the_limit_of_the_settings_is_that_of_the_sweep(tmp_path: Path) -> None:
     with TestClient(app, raise_server_exceptions=False) as server:
         (fault,) = read_faults(server.post(URL, json=BODY), 422, "invalid")
     assert "8 runs; a job may have at most 7" in fault["detail"]
+
+
+OSCILLATOR: dict[str, Any] = {
+    "model": "duffing-eq16",
+    "truth": {
+        "parameters": {"c": 0.2, "L": 0.5, "b": 5.0, "a": 1.0},
+        "inputs": {"q": {"kind": "expression", "expression": "10*cos(5*t)"}},
+        "samples": 300,
+        "sample_time": 0.02,
+    },
+    "sigma": [0, 1e-4],
+    "place": "plant",
+    "prediction": "one-step",
+    "methods": ["improved"],
+}
+
+
+def test_noise_enters_the_recursion_and_has_its_own_bound(server: TestClient) -> None:
+    body = {**OSCILLATOR, "replicates": 3}
+    job = server.post(URL, json=body).json()["id"]
+    carry_out_job(parts_of(server), job)
+    summary = server.get(f"/v1/jobs/{job}/summary").json()
+    quiet, noisy = summary["groups"]
+    # The bounds of `benchmarks.noisy_recursion`, to first order in the noise.
+    for name, bound in {"c": 0.0113, "L": 0.0101, "b": 0.0632, "a": 0.0741}.items():
+        (one,) = [p for p in noisy["parameters"] if p["name"] == name]
+        assert one["cramer_rao_bound"] == pytest.approx(bound, rel=0.03)
+        assert 0 < abs(one["error"][2]) < 3 * bound
+    assert noisy["rms_cramer_rao_bound"] is None
+    assert quiet["parameters"][0]["error"][2] == pytest.approx(0, abs=1e-6)
+    (stored,) = [
+        run
+        for run in server.get(f"/v1/jobs/{job}/runs").json()["items"]
+        if run["cell"]["/noise/sigma"] and run["cell"]["/seed"] == 1_000_001
+    ]
+    found = server.get(f"/v1/runs/{stored['id']}").json()
+    assert found["rms"] == pytest.approx(1e-4, rel=0.1)
+
+
+def test_noise_inside_the_plant_needs_its_place_and_its_truth(server: TestClient) -> None:
+    truth = {**OSCILLATOR["truth"], "parameters": {"c": 0.2, "L": 0.5, "b": 5.0}}
+    assert [
+        fault["pointer"]
+        for fault in read_faults(
+            server.post(URL, json={**OSCILLATOR, "truth": truth}), 422, "invalid"
+        )
+    ] == ["/truth/parameters/a"]
+    (fault,) = read_faults(server.post(URL, json={**BODY, "place": "plant"}), 422, "invalid")
+    assert fault["pointer"] == "/place"
+    assert "Write noise: {plant: {x: estimate}} there" in fault["detail"]
+    body = {key: value for key, value in OSCILLATOR.items() if key != "truth"}
+    (fault,) = read_faults(server.post(URL, json={**body, "datasets": ["x"]}), 422, "invalid")
+    assert "needs 'truth'" in fault["detail"]
+    hidden = {**BODY, "model": "coulomb-delay", "place": "plant", "parameters": {}}
+    hidden["truth"] = {**OSCILLATOR["truth"], "parameters": {"c": 0.2, "L": 0.5, "b": 5, "mu": 0.5}}
+    _, summary = carry_out_sweep(server, **hidden)
+    assert summary["groups"][-1]["parameters"][0]["cramer_rao_bound"] is None
+    assert any("of one state that is measured" in note for note in summary["notes"])

@@ -192,7 +192,7 @@ def test_the_validation_part_is_read_as_the_estimation_part() -> None:
     record = Recording((Channel("u", times, u), Channel("y", times, u))).to_record(
         {"u": "u"}, {"y": "y"}
     )
-    parts = prepare_records([record], fraction=0.5)
+    parts = prepare_records(load_model("fopdt"), [record], fraction=0.5)
     assert parts.validation is not None
     assert parts.validation_runs is not None
     holds = [

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from service.formats.read_options import ReadOptions
 from service.formats.tabular.csv_recordings import read_csv
 from sysid.data.derivations import derive_recording
 from sysid.data.records import Recording
@@ -18,7 +19,7 @@ pytestmark = pytest.mark.data
 
 @cache
 def read_tubes() -> Recording:
-    return read_csv(DATA / "pneuact_tube" / "pneuact_tube.csv", segments=LABELS)[0]
+    return read_csv(DATA / "pneuact_tube" / "pneuact_tube.csv", ReadOptions(segments=LABELS))[0]
 
 
 def tube(remainder: int) -> Recording:

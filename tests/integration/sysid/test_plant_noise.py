@@ -277,3 +277,64 @@ def test_bands_and_disturbances_of_several_outputs_are_those_of_the_fit() -> Non
             np.testing.assert_allclose(band.simulated, values, rtol=1e-9)
         (load,) = found.compute_disturbances(number)
         assert np.isfinite(load.band).all()
+
+
+OSCILLATOR = {"c": 0.2, "L": 0.5, "b": 5.0, "a": 1.0}
+
+
+def make_oscillator(plant: float, sensor: float, seed: int = 1) -> Record:
+    """Eq. 16 with φ as printed: added to each sample of the recursion (m)."""
+    random, h, n = np.random.default_rng(seed), 0.02, 300
+    times = h * np.arange(n)
+    q, x = 10 * np.cos(5 * times), np.zeros(n + 27)  # the past is 0
+    for k in range(29, n + 27):
+        damper = 0.2 * (x[k - 26] - x[k - 27]) / h
+        spring = 5.0 * x[k - 2] + x[k - 2] ** 3
+        force = q[k - 29] - damper - spring
+        x[k] = 2 * x[k - 1] - x[k - 2] + h**2 * force + plant * random.normal()
+    y = x[27:] + sensor * random.normal(size=n)
+    return Record((Channel("q", times, q, "N"),), (Channel("y", times, y, "m"),))
+
+
+def test_noise_in_the_papers_recursion_is_told_from_that_of_its_sensor(tmp_path: Path) -> None:
+    record = make_oscillator(1e-4, 0.01)
+    found = identify("duffing-eq16", record, loss=Loss(noise_model="plant"))
+    for name, true in OSCILLATOR.items():
+        assert abs(found[name].value - true) < 3.0 * found[name].stderr, name
+    assert found.plant_noise is not None
+    sensor, plant = found.plant_noise.sources
+    assert sensor.deviation == pytest.approx(0.01, rel=0.15)
+    assert plant.deviation == pytest.approx(1e-4, rel=0.5)
+    assert (plant.place, plant.kind, plant.unit) == ("x", "plant", "m")
+    found.save(tmp_path / "found.json")
+    assert Identification.load(tmp_path / "found.json") == found
+    assert "noise[x]" not in export_model(load_model("duffing-eq16"), found, "json")
+    assert "observer" not in export_model(load_model("duffing-eq16"), found, "c")
+    errors = [one.rms for one in found.plant_noise.prediction_errors]
+    assert np.all(np.diff(errors) > 0)
+    (state,) = found.compute_disturbances()
+    true = make_oscillator(1e-4, 0.0).outputs[0].values  # the noises of other draws are the same
+    inside = (state.band[:, 0] <= true) & (true <= state.band[:, 1])
+    assert np.mean(inside) > 0.8
+    (band,) = found.compute_bands()
+    np.testing.assert_allclose(band.simulated, found.simulated[0][0])
+
+
+def test_without_a_sensor_the_filter_is_the_prediction_one_step_ahead() -> None:
+    record = make_oscillator(1e-4, 0.0)
+    filtered = identify("duffing-eq16", record, loss=Loss(noise_model="plant"))
+    ahead = identify("duffing-eq16", record, prediction="one-step")
+    for name in OSCILLATOR:
+        one, other = filtered[name], ahead[name]
+        assert one.status == other.status == "identified"
+        assert one.stderr == pytest.approx(other.stderr, rel=0.05)
+        assert abs(one.value - other.value) < 0.02 * other.stderr, name
+    assert filtered.plant_noise is not None
+    assert filtered.plant_noise.sources[1].deviation == pytest.approx(1e-4, rel=0.1)
+    assert identify("duffing-eq16", record).noise_model == "plant"
+
+
+def test_a_recursion_without_noise_inside_takes_no_filter() -> None:
+    found = identify("duffing-eq16", make_oscillator(0.0, 0.01))
+    assert found.noise_model == "white"
+    assert found.verdict.trust == "trustworthy"

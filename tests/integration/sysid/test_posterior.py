@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from service.datasets.signal_channels import map_channels
+from service.formats.read_options import ReadOptions
 from service.formats.tabular.csv_recordings import read_csv
 from sysid.core.settings import Loss
 from sysid.data.derivations import derive_recording
@@ -18,7 +19,9 @@ LABELS = ("length_m", "p_nom_bar", "phase", "file", "repeat")
 
 def read_tube(length: float, pressure: float) -> Record:
     """The pooled filling of a pneumatic tube."""
-    recording, _ = read_csv(DATA / "pneuact_tube" / "pneuact_tube.csv", segments=LABELS)
+    recording, _ = read_csv(
+        DATA / "pneuact_tube" / "pneuact_tube.csv", ReadOptions(segments=LABELS)
+    )
     chosen = {"length_m": length, "p_nom_bar": pressure, "phase": "fill"}
     pooling = {"input": "p_in_bar", "outputs": ["p_out_bar"], "bin": 0.003, "start": 0, "stop": 1}
     pooled = derive_recording(recording, [{"select": chosen}, {"pool": pooling}])

@@ -157,7 +157,8 @@ class ModelTwin:
             name = self.names[i]
             given = experiment.starts[i].first_values
             if isinstance(start, DerivedInitial):
-                given = np.array([self._value(start.expression, 0, 0.0, {}, 0)])
+                begun = {name: past[0] for name, past in self.past.items()}
+                given = np.array([self._value(start.expression, 0, 0.0, begun, 0)])
             if isinstance(start, EstimatedInitial):
                 given = np.array([values[name_initial_state(name, number)]])
             self.past[name] = [float(given[0])]
@@ -216,7 +217,7 @@ class ModelTwin:
     def _next(self, m: int) -> dict[str, float]:
         if not self.difference:
             return self._integrate(m)
-        if m + 1 < self.model.memory:
+        if m + 1 < self.model.memory and not self.model.corrections:
             return {n: self.given[n][m] if self.given[n] else self.first[n] for n in self.names}
         values: dict[str, float] = {}
         for i in self.model.order:

@@ -14,6 +14,7 @@ from starlette.testclient import TestClient
 from service.api.requests.dependencies import Parts
 from service.core.settings import Settings
 from service.datasets.datasets import add_recording, hash_source
+from service.formats.read_options import ReadOptions
 from service.formats.tabular.csv_recordings import read_csv
 from tests.support.storage.databases import copy_sqlite_template
 
@@ -79,13 +80,13 @@ def store_csv_in(
     parts: Parts, content: bytes, name: str = "steps", segments: Sequence[str] = ()
 ) -> str:
     """The same for the project that these parts show."""
+    options = ReadOptions(segments=tuple(segments))
     source = {
         "sha256": sha256(content).hexdigest(),
         "format": "csv",
-        "segments": list(segments),
-        "sample_time": None,
+        **options.list_given(),
     }
-    read, notes = read_csv(content, segments=segments)
+    read, notes = read_csv(content, options)
     details = {"source": source, "warnings": list(notes)}
     key = hash_source(source)
     return add_recording(

@@ -55,6 +55,7 @@ def conclude(
             noise_deviations=None,
             residual_tests=ResidualTests("estimation", None, ()),
             onset_delays=(),
+            time_unit="s",
             data_bounds=(),
             input_hold=(),
             commands=(),

@@ -134,8 +134,8 @@ def test_a_file_after_json_is_refused_with_the_option_that_writes_it() -> None:
         assert "To write one: --output b.json" in line
     line = check_refusal(run_lagid("jobs", "--json", "jobs.json"), 2)
     assert "To write one: --json > jobs.json" in line
-    line = check_refusal(run_lagid("identify", "a.csv", "b.csv", "--model", "fopdt", "--json"), 2)
-    assert "--json" not in line
+    line = check_refusal(run_lagid("identify", "a.csv", "b.csv", "--model", "fopdt", "--json"), 1)
+    assert "there is no file a.csv" in line
 
 
 def test_a_missing_choice_is_told_with_the_choices() -> None:

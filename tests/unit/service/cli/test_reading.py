@@ -8,14 +8,15 @@ import pytest
 import typer
 
 from service.cli.common import report_faults, upload_origins
-from service.cli.identify_command import FileOptions, read_input_file
+from service.cli.identify_command import read_input_file
 from service.client.calls import build_upload, raise_for_problem
+from service.formats.read_options import ReadOptions
 from tests.support.files.experiment_files import TIMES, join_rows, write_parquet
 
 
 def refuse(path: Path, capsys: pytest.CaptureFixture[str], *segments: str) -> str:
     with pytest.raises(typer.Exit):
-        read_input_file(path, FileOptions(None, segments))
+        read_input_file(path, ReadOptions(segments=segments))
     line = capsys.readouterr().err
     assert line.count("\n") == 1
     assert "Traceback" not in line
@@ -25,7 +26,7 @@ def refuse(path: Path, capsys: pytest.CaptureFixture[str], *segments: str) -> st
 def test_guesses_are_notes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "rig.txt"
     path.write_text("Device: rig\n\n" + join_rows("Zeit;u;y", ";"))
-    recording = read_input_file(path, FileOptions(None, ()))
+    recording = read_input_file(path, ReadOptions())
     np.testing.assert_array_equal(recording.channel("u").times, TIMES)
     notes = capsys.readouterr().err.splitlines()
     assert "note: the header is in row 3; the lines before it were skipped" in notes
@@ -45,7 +46,7 @@ def test_a_refusal_names_the_file_and_the_options(
     path.write_text("t,n,u\n0,1,1\n1,2,2\n2,3,3\n")
     assert "leave columns of times and signals out of --segments" in refuse(path, capsys, "n")
     path.write_text('{"t": []}')
-    assert "the file is JSON, which is not read; write the signals" in refuse(path, capsys)
+    assert "the JSON holds no list of records. Write one for each time" in refuse(path, capsys)
 
 
 def test_refusals_of_the_server_name_options_too(capsys: pytest.CaptureFixture[str]) -> None:
@@ -76,6 +77,6 @@ def test_columns_called_like_options_keep_their_names(
 
 @pytest.mark.parametrize("name", ["a.csv", "a.xlsx", "a.csv.gz", "a", "a.unknown"])
 def test_a_client_sends_bytes_whatever_the_name(name: str) -> None:
-    call = build_upload(Path(name), None, None, None)
+    call = build_upload(Path(name), None, {})
     assert call.headers["content-type"] == "application/octet-stream"
     assert call.params["name"] == "a"

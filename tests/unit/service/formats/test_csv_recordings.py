@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from service.formats.limits import DEFAULT_LIMITS
+from service.formats.read_options import ReadOptions
 from service.formats.tabular.csv_recordings import generate_csv, read_csv
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
@@ -16,7 +17,7 @@ from sysid.inspection.inspect import check_recording
 def read_refusal(content: str | bytes, **options: object) -> UnreadableFile:
     data = content if isinstance(content, bytes) else content.encode()
     with pytest.raises(UnreadableFile) as caught:
-        read_csv(data, **options)  # type: ignore[arg-type]
+        read_csv(data, ReadOptions(**options))  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     return caught.value
 
@@ -78,9 +79,9 @@ def test_a_byte_order_mark_windows_line_ends_blank_rows_and_quotes_do_no_harm() 
 
 
 def test_a_given_sampling_period_stands_for_the_time_column() -> None:
-    recording, _ = read_csv(b"u,y\n1,2\n3,4\n5,6\n", sample_time=0.5)
+    recording, _ = read_csv(b"u,y\n1,2\n3,4\n5,6\n", ReadOptions(sample_time=0.5))
     np.testing.assert_array_equal(recording.channel("y").times, [0, 0.5, 1])
-    single, _ = read_csv(b"u\n1\n2\n", sample_time=0.5)
+    single, _ = read_csv(b"u\n1\n2\n", ReadOptions(sample_time=0.5))
     assert single.names == ("u",)
 
 
@@ -114,7 +115,7 @@ def test_segments_are_laid_end_to_end_with_their_labels() -> None:
     content = (
         b"length,phase,t,u\n1,fill,0,1\n1,fill,0.5,2\n1,vent,0.1,3\n1,vent,0.3,4\n2,vent,0,5\n"
     )
-    recording, _ = read_csv(content, segments=("length", "phase"))
+    recording, _ = read_csv(content, ReadOptions(segments=("length", "phase")))
     assert recording.names == ("u",)
     np.testing.assert_array_equal(recording.channel("u").times, [0, 0.5, 1, 1.2, 2])
     assert [dict(one.labels) for one in recording.segments] == [
@@ -128,7 +129,7 @@ def test_segments_are_laid_end_to_end_with_their_labels() -> None:
 
 def test_the_axis_of_segments_has_the_decimals_that_were_written() -> None:
     rows = "".join(f"{n},{0.3 + 0.1 * k:.1f},{k}\n" for n in range(4) for k in range(9))
-    recording, _ = read_csv(f"n,t,u\n{rows}".encode(), segments=("n",))
+    recording, _ = read_csv(f"n,t,u\n{rows}".encode(), ReadOptions(segments=("n",)))
     expected = [float(f"{n + 0.1 * k:.1f}") for n in range(4) for k in range(9)]
     assert recording.channel("u").times.tolist() == expected
     for piece in recording.split_segments():
@@ -136,13 +137,13 @@ def test_the_axis_of_segments_has_the_decimals_that_were_written() -> None:
 
 
 def test_a_segment_as_long_as_a_round_step_does_not_touch_the_next() -> None:
-    recording, _ = read_csv(b"n,t,u\n1,0,1\n1,1,2\n2,0,3\n2,1,4\n", segments=("n",))
+    recording, _ = read_csv(b"n,t,u\n1,0,1\n1,1,2\n2,0,3\n2,1,4\n", ReadOptions(segments=("n",)))
     assert recording.channel("u").times.tolist() == [0.0, 1.0, 2.0, 3.0]
 
 
 def test_labels_are_numbers_only_if_all_of_them_are_finite() -> None:
     recording, _ = read_csv(
-        b"n,m,t,u\n1,1,0,1\n1,1,1,1\nnan,2,0,2\nnan,2,1,2\n", segments=("n", "m")
+        b"n,m,t,u\n1,1,0,1\n1,1,1,1\nnan,2,0,2\nnan,2,1,2\n", ReadOptions(segments=("n", "m"))
     )
     assert [dict(one.labels) for one in recording.segments] == [
         {"n": "1", "m": 1.0},
@@ -151,7 +152,7 @@ def test_labels_are_numbers_only_if_all_of_them_are_finite() -> None:
 
 
 def test_equal_times_are_allowed_inside_repeats_only() -> None:
-    recording, notes = read_csv(b"n,t,u\n1,0,1\n1,0,2\n2,0,3\n", segments=("n",))
+    recording, notes = read_csv(b"n,t,u\n1,0,1\n1,0,2\n2,0,3\n", ReadOptions(segments=("n",)))
     assert recording.samples == 3
     assert any("same time" in note for note in notes)
 
@@ -203,7 +204,7 @@ def test_repeated_and_decreasing_times_are_told_with_both_values(rows: str, word
         ("t [V],u\n0,1\n", "times are in [V]; need seconds, or another unit of time"),
         ("t [Hz],u\n0,1\n", "need seconds"),
         ("t;u\n0.5;1,5\n", "other numbers of the file have points"),
-        ("t;u\n1,5;2,5\n2,5;abc.d\n", "name it in segments"),
+        ("t;u\n1,5;2,5\n2,5;abc.d\n", "marks a bad value, give missing=abc.d"),
         ("t,u,u\n0,1,2\n", "names must differ"),
         ("t,u\n0,1\n1\n", "has 1 fields, but the header has 2"),
         ("t,u\n0,1\n1,2,3\n", "has 3 fields, but the header has 2"),
@@ -301,11 +302,11 @@ def test_no_name_or_label_is_a_formula_in_a_spreadsheet_and_each_comes_back(
     name: str, written: str
 ) -> None:
     content = f"t,run,{name} [V],y [m]\n0,{name},1,2\n1,{name},1,2\n"
-    before, _ = read_csv(content.encode(), segments=["run"])
+    before, _ = read_csv(content.encode(), ReadOptions(segments=("run",)))
     text = "".join(generate_csv(before))
     assert text.splitlines()[0] == f"t,run,{written} [V],y [m]"
     assert text.splitlines()[1].split(",")[1] == written
-    after, _ = read_csv(text.encode(), segments=["run"])
+    after, _ = read_csv(text.encode(), ReadOptions(segments=("run",)))
     assert [channel.name for channel in after.channels] == [name, "y"]
     assert after.segments == before.segments
 
@@ -320,10 +321,13 @@ def test_more_signals_than_the_limit_are_refused_before_anything_below_the_heade
         error = read_refusal(f"{header}\n0,this is no row\n", limits=limits, **options)
         assert error.row == 1
         assert f"the header has {header.count(',') + 1} columns; at most 3 signals" in str(error)
-    assert len(read_csv(b"t,a,b,c\n0,1,2,3\n", limits=limits)[0].channels) == 3
+    assert len(read_csv(b"t,a,b,c\n0,1,2,3\n", ReadOptions(limits=limits))[0].channels) == 3
 
 
 def test_more_rows_than_the_limit_are_refused() -> None:
     limits = replace(DEFAULT_LIMITS, messages=3)
-    assert read_csv(b"t,u\n0,1\n1,2\n2,3\n", limits=limits)[0].channels[0].values.size == 3
+    assert (
+        read_csv(b"t,u\n0,1\n1,2\n2,3\n", ReadOptions(limits=limits))[0].channels[0].values.size
+        == 3
+    )
     assert "more than 3 rows" in str(read_refusal("t,u\n0,1\n1,2\n2,3\n3,4\n", limits=limits))

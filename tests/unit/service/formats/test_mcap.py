@@ -27,6 +27,7 @@ from service.formats.mcap.mcap_files import (
     write_fitted_outputs,
     write_recording,
 )
+from sysid.core.types import FloatArray
 from sysid.data.records import Channel, History, Recording, Segment
 from tests.support.files.mcap_files import read_run_record, write_mcap_bytes
 
@@ -343,3 +344,36 @@ def test_names_and_segments_that_the_reader_would_refuse_are_not_written(
     spans = tuple(Segment(float(n), n + 0.5, float(n), {"run": float(n)}) for n in range(20))
     with pytest.raises(ValueError, match="too many segments"):
         write_mcap_bytes(Recording((Channel("u", np.arange(20.0), np.zeros(20)),), spans))
+
+
+@pytest.mark.parametrize("clock", ["2026-03-14T08:00:00.250001+02:00", "2026-03-14T08:00:00.25"])
+@pytest.mark.parametrize("times", [TIMES, np.arange(50) * 0.1, np.array([-2.5, 0.0, 1 / 3])])
+def test_viewers_see_the_day_and_times_come_back(clock: str, times: FloatArray) -> None:
+    start = datetime.fromisoformat(clock)
+    history = History(np.array([-3.0, -2.75]), np.array([1.0, 2.0])) if times[0] >= 0 else None
+    channel = Channel("u", times, np.sin(times), history=history)
+    content = write_mcap_bytes(Recording((channel,), started_at=start))
+    back = read_mcap(content)
+    assert back.started_at == start
+    assert back.channel("u").times.tobytes() == times.tobytes()
+    moment = start if start.tzinfo else start.replace(tzinfo=UTC)
+    messages = list(make_reader(BytesIO(content)).iter_messages())
+    logged = {one.topic: message.log_time for _, one, message in reversed(messages)}
+    first = round(moment.timestamp() * 1e6) * 1000 + round(times[0] * 1e9)
+    assert abs(logged["/signals"] - first) <= 1000
+    if history is not None:
+        assert back.channel("u").history is not None
+        assert logged["/history"] - logged["/signals"] == round((-3.0 - times[0]) * 1e9)
+
+
+def test_a_recording_of_before_1970_keeps_a_clock_of_its_own() -> None:
+    start = datetime(1969, 12, 31, tzinfo=UTC)
+    back = read_mcap(write_mcap_bytes(Recording((Channel("u", TIMES, TIMES),), started_at=start)))
+    assert back.started_at == start
+    np.testing.assert_array_equal(back.channel("u").times, TIMES)
+
+
+def test_the_unit_of_the_times_of_a_source_comes_back() -> None:
+    channel = Channel("u", TIMES, TIMES, time_unit="min")
+    assert read_mcap(write_mcap_bytes(Recording((channel,)))).channel("u").time_unit == "min"
+    assert read_mcap(write_mcap_bytes(two_bases())).channels[0].time_unit == "s"

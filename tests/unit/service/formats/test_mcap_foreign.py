@@ -1,6 +1,7 @@
 """Files of other programs: what is read, what is left out, and what is refused."""
 
 import struct
+from io import BytesIO
 
 import numpy as np
 import pytest
@@ -8,11 +9,12 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Kind
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
-from mcap.writer import CompressionType
+from mcap.writer import CompressionType, Writer
 
 from service.formats.limits import DEFAULT_LIMITS
 from service.formats.mcap.mcap_files import read_mcap_with_notes
 from service.formats.mcap.mcap_messages import build_schema
+from service.formats.read_options import Clock
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 from tests.support.files.mcap_files import json_messages, write_foreign_bytes
@@ -120,6 +122,55 @@ def test_the_times_of_a_clock_are_counted_from_the_first_of_any_topic() -> None:
     recording, _ = read(content)
     assert recording.channel("early.x").times.tolist() == [0.0]
     assert recording.channel("late.x").times.tolist() == [1.0]
+
+
+PERIOD, SENT, LOGGED = 100_000_000, 3_000_000, 7_000_000  # ns
+START_NS = 1_760_000_000 * 10**9
+
+
+def write_clocks(stamp: str = '"header": {"stamp": {"sec": %d, "nanosec": %d}}, ') -> bytes:
+    """JSON messages stamped each 0.1 s, sent 3 ms later, and logged 7 ms later and with jitter."""
+    stream = BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    number = writer.register_schema("A", "jsonschema", b"{}")
+    channel = writer.register_channel("/a", "json", number)
+    for k in range(20):
+        moment = START_NS + k * PERIOD
+        head = stamp % divmod(moment, 10**9) if stamp else ""
+        logged = moment + LOGGED + (k % 3) * 1_000_000
+        writer.add_message(channel, logged, f'{{{head}"x": {k}}}'.encode(), moment + SENT)
+    writer.finish()
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("clock", ["publish", "stamp"])
+def test_times_are_those_of_the_chosen_clock(clock: Clock) -> None:
+    recording, notes = read_mcap_with_notes(write_clocks(), DEFAULT_LIMITS, clock)
+    assert recording.names == ("x",)
+    np.testing.assert_array_equal(recording.channel("x").times, np.arange(20) / 10)
+    assert recording.started_at is not None
+    delay = SENT if clock == "publish" else 0
+    assert recording.started_at.timestamp() == (START_NS + delay) / 1e9
+    told = " ".join(notes)
+    assert "the log time comes 5 ms after the publish time in the median, 4 to 6 ms" in told
+    assert "comes 8 ms after the stamp in the header in the median, 7 to 9 ms" in told
+    assert "The clock is chosen by clock=publish" in told
+
+
+def test_the_log_time_is_the_clock_if_none_is_chosen() -> None:
+    recording, _ = read(write_clocks())
+    late = np.arange(20) / 10 + (np.arange(20) % 3) / 1000
+    np.testing.assert_allclose(recording.channel("x").times, late, atol=1e-12)
+
+
+def test_messages_without_the_clock_are_refused_with_those_they_have() -> None:
+    with pytest.raises(UnreadableFile) as caught:
+        read_mcap_with_notes(write_clocks(""), DEFAULT_LIMITS, "stamp")
+    assert str(caught.value) == (
+        "topic '/a' has no stamp in a header, such as header.stamp; its clocks are log, publish: "
+        "give one of them as clock"
+    )
 
 
 PAIR = ("lagid.Pair", "protobuf", build_schema("Pair", ("x", "y")))

@@ -18,7 +18,7 @@ import pytest
 import lagid
 from service.formats import recordings
 from service.formats.file_kinds import SUFFIXES, detect_kind
-from service.formats.limits import ReadOptions
+from service.formats.read_options import ReadOptions
 from service.formats.recordings import read_recording, read_with_notes
 from service.formats.sandbox_child import read_file
 from service.formats.tabular import csv_recordings, table_columns
@@ -257,7 +257,7 @@ def test_stamps_that_are_too_coarse_or_mixed_are_refused_with_the_way_out() -> N
     coarse = join_rows("Zeit,u,y", time=stamp("%Y-%m-%d %H:%M:%S")).encode()
     with pytest.raises(UnreadableFile, match="too coarse, give the sampling period with sample_t"):
         read_csv(coarse)
-    recording, notes = read_csv(coarse, sample_time=0.1)
+    recording, notes = read_csv(coarse, ReadOptions(sample_time=0.1))
     np.testing.assert_allclose(recording.channel("u").times, TIMES, atol=1e-12)
     assert recording.started_at == START
     assert "samples are 0.1 s apart; column 'Zeit' gives the start" in notes
@@ -295,10 +295,9 @@ REFUSED = {
     ),
     "units in cells": (join_rows("t,u,y", end=" V"), "write numbers alone, and their unit"),
     "thousands": ("t;y\n0.1;1,000.5\n0.2;1,001.5\n", "thousands separators"),
-    "no header": (BODY, "need a header that names the columns: put a line such as t,u,y"),
+    "no header": (BODY, "so the file has no header; name its columns with columns=t,c1,c2"),
     "no time": (join_rows("a,u,y"), "give the sampling period"),
-    "JSON": ('{"t": [0, 1], "u": [0, 1]}', "the file is JSON, which is not read; write the"),
-    "JSON lines": ('[{"t": 0}]', "JSON"),
+    "JSON of one column": ('[{"t": 0}]', "there is only one column ('t')"),
     "XML": ('<?xml version="1.0"?><a/>', "XML or HTML, which is not read"),
 }
 
@@ -316,7 +315,7 @@ def test_what_cannot_be_read_is_refused_with_what_to_do(
     ("head", "words"),
     [
         (b"\x89HDF\r\n\x1a\n" + bytes(100), "HDF5"),
-        (b"MATLAB 7.3 MAT-file" + bytes(500), "'-v7'"),
+        (b"MATLAB 7.3 MAT-file" + bytes(500), "the MATLAB file cannot be read"),
         (b"MDF     4.10" + bytes(60), "ASAM MDF"),
         (b"TDSm" + bytes(60), "NI TDMS"),
         (b"PK\x03\x04" + bytes(22) + b"\x05\0\0\0a.csv" + bytes(60), "a ZIP archive"),
@@ -380,7 +379,7 @@ def test_a_fault_in_the_last_rows_is_no_footer(end: str) -> None:
 def test_labels_that_divide_every_row_are_refused() -> None:
     text = join_rows("Zeit,u,y", time=stamp("%Y-%m-%d %H:%M:%S.%f"))
     with pytest.raises(UnreadableFile, match=f"into {N} segments, of which {N} have one sample"):
-        read_csv(text.encode(), segments=("Zeit",), sample_time=0.1)
+        read_csv(text.encode(), ReadOptions(segments=("Zeit",), sample_time=0.1))
 
 
 ARRAYS: dict[str, dict[str, object]] = {
@@ -540,7 +539,7 @@ def test_a_wrong_argument_of_the_reader_is_told(arguments: dict[str, Any], told:
 
 def test_one_label_column_may_be_a_text() -> None:
     rows = b"run,t,u\na,0,1\na,1,2\nb,0,3\nb,1,4\n"
-    recording, _ = read_with_notes(rows, segments="run")
+    recording, _ = read_with_notes(rows, ReadOptions(segments=("run",)))
     assert [segment.labels["run"] for segment in recording.segments] == ["a", "b"]
 
 
@@ -674,7 +673,7 @@ LATE = PEEK_ROWS + 50  # a row after those that the layout is guessed from
 
 
 def read_rows(rows: list[str], **reading: object) -> tuple[Recording, tuple[str, ...]]:
-    return read_with_notes("\n".join(rows).encode(), **reading)
+    return read_with_notes("\n".join(rows).encode(), ReadOptions(**reading))
 
 
 @pytest.mark.parametrize("separator", [";", "\t", "|", " "])

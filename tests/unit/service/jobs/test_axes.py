@@ -78,7 +78,7 @@ def test_a_cell_changes_its_fields_and_nothing_else() -> None:
     changed = build_run_body(
         whole, {"/noise/sigma": 0.5, "/parameters/L/upper": 2.0, "/datasets/1": "x"}
     )
-    assert changed["noise"] == {"sigma": 0.5, "seed": 0}
+    assert changed["noise"] == {**whole["noise"], "sigma": 0.5}
     assert changed["parameters"] == {"L": {"upper": 2.0}}
     assert changed["datasets"] == ["ds_1", "x"]
     assert whole == job().to_normal_form()

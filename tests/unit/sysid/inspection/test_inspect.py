@@ -14,6 +14,7 @@ from service.formats.recordings import read_with_notes
 from sysid.core.types import FloatArray
 from sysid.data.records import Segment
 from sysid.inspection.inspect import inspect_recording
+from sysid.inspection.resampling import find_knots, measure_drawn
 
 SAMPLES, PERIOD = 500, 0.5
 SEED = 41_000
@@ -61,7 +62,7 @@ def store_means(values: FloatArray) -> FloatArray:
         (lambda y: y, []),
         (repeat_each, ["repeated reading"]),
         (lambda y: round_to(y, 0.5), ["quantisation"]),
-        (lambda y: round_to(y, 0.15), ["quantisation"]),
+        (lambda y: round_to(y, 0.15), []),
         (lambda y: round_to(y, 0.05), []),
         (lambda y: round_to(y, 0.001), []),
         (lambda y: np.minimum(y, 23.0), ["limit of a sensor"]),
@@ -166,3 +167,12 @@ def test_what_an_mcap_file_says_is_inspected_like_a_table(tmp_path: Path) -> Non
     write_recording(Recording((Channel("y", times, values),)), tmp_path / "gap.mcap")
     recording, _ = read_with_notes(tmp_path / "gap.mcap")
     assert [one.explanation for one in check_recording(recording)] == ["outage"]
+
+
+def test_values_in_steps_lie_on_lines_by_chance_and_interpolated_ones_do_not() -> None:
+    times = PERIOD * np.arange(SAMPLES)
+    for values, is_drawn in (
+        (round_to(build_signal(), 0.05), False),
+        (resample(build_signal()), True),
+    ):
+        assert (measure_drawn(values, find_knots(times, values)) > 0.0) == is_drawn

@@ -156,7 +156,7 @@ def test_signals_of_a_finer_step_are_computed_again_bit_for_bit() -> None:
     record = sample_plant(STIFF)
     found = identify(two_lags(1), record, QUICK, validation_fraction=0.3)
     assert found.substeps > 1
-    records = prepare_records([record], fraction=0.3)
+    records = prepare_records(two_lags(1), [record], fraction=0.3)
     again = resimulate_run(two_lags(1), records, FitSettings(), found.parameters, found.substeps)
     assert [one.tobytes() for one in again.simulated[0]] == [
         one.tobytes() for one in found.simulated[0]

@@ -257,24 +257,6 @@ def test_noise_without_a_place_is_a_fault(noise: object, pointer: str, text: str
     assert text in caught.value.faults[0].detail
 
 
-def test_a_recursion_has_no_noise_in_its_document() -> None:
-    document = {
-        "name": "recursion",
-        "form": "difference",
-        "inputs": {"u": "1"},
-        "states": {"x": "1"},
-        "parameters": {"c": {"lower": 0, "upper": 1}},
-        "equations": {"x": "c*x(k-1) + u(k-1)"},
-        "outputs": {"y": "x"},
-        "noise": {"plant": {"x": "estimate"}},
-    }
-    with pytest.raises(InvalidModel, match="differential form"):
-        parse_model(document)
-    model = parse_model({key: value for key, value in document.items() if key != "noise"})
-    with pytest.raises(InvalidSettings, match="not of the differential form"):
-        Problem.build(model, [_record()], loss=Loss(noise_model="plant"))
-
-
 def test_irregular_samples_are_refused_with_the_way_out() -> None:
     random = np.random.default_rng(1)
     times = np.sort(random.random(SAMPLES)) * PERIOD * SAMPLES

@@ -50,6 +50,16 @@ def test_the_order_reassures_nobody_beside_another_doubt() -> None:
     assert list_evidence(doubted) == list_evidence(told) == []
 
 
+def test_times_are_told_in_the_unit_of_the_record_too() -> None:
+    found = find(time_unit="min")
+    estimates = tuple(
+        replace(one, unit="s" if one.name == "L" else "1") for one in found.parameters
+    )
+    assert list_evidence(replace(found, parameters=estimates))[0] == "in min: L 0.0262 ± 0.0012"
+    no_times = replace(found, parameters=tuple(replace(one, unit="1") for one in estimates))
+    assert list_evidence(no_times) == []
+
+
 def test_failed_tests_beside_a_trustworthy_result_are_explained() -> None:
     failed = "residuals on estimation data: failed: y is not white (p < 0.001)"
     calm = find(residual_tests=COLOURED)

@@ -119,6 +119,37 @@ def test_states_that_noise_moves_are_estimated_from_all_outputs() -> None:
     np.testing.assert_allclose(state.band[:, 1] - state.values, half, rtol=1e-5)
 
 
+@pytest.mark.parametrize("start", ["measured", 0.4])
+def test_samples_of_a_recursion_are_estimated_from_those_after_them(start: Any) -> None:
+    document = {
+        **DOCUMENT,
+        "form": "difference",
+        "parameters": {"a": {"lower": 0, "upper": 2}, "b": {"lower": -1, "upper": 1}},
+        "equations": {"x": "a*x(k-1) + b*x(k-2) + u(k-1)"},
+        "initial": {"x": start},
+        "solver": {},
+        "noise": {"plant": {"x": "estimate"}},
+    }
+    record, size = make_record(missing=(7, 8)), 0.6
+    problem = Problem.build(parse_model(document), [record], loss=Loss(noise_model="plant"))
+    theta = np.array([1.5, -0.7, size])
+    [[state]] = estimate_disturbances(problem, theta, spread_by(problem))
+    # x = F (x(0), x(1), φ(2), …)
+    moves = np.eye(SAMPLES)
+    for k in range(2, SAMPLES):
+        moves[k] += 1.5 * moves[k - 1] - 0.7 * moves[k - 2]
+    known = np.isfinite(y := record.outputs[0].values)
+    base = moves[:, :2].sum(axis=1) * (0.0 if start == "measured" else start)
+    moves = moves if start == "measured" else moves[:, 2:]
+    precision = np.r_[[0.0] * (moves.shape[1] - SAMPLES + 2), [size**-2] * (SAMPLES - 2)]
+    spread = np.linalg.inv(np.diag(precision) + moves[known].T @ moves[known])
+    mean = base + moves @ spread @ moves[known].T @ (y - base)[known]
+    left = np.sqrt(np.diag(moves @ spread @ moves.T))
+    np.testing.assert_allclose(state.values, mean, atol=1e-5)
+    half = TWICE * measure_sensor(problem, theta) * left
+    np.testing.assert_allclose(state.band[:, 1] - state.values, half, atol=1e-4)
+
+
 def test_errors_of_the_parameters_widen_the_band() -> None:
     problem = Problem.build(
         parse_model(
