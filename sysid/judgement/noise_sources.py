@@ -20,13 +20,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sysid.core.findings import Finding
 from sysid.core.text import join_names, plain_estimate, plain_unit
 from sysid.core.types import RANK_TOLERANCE, FloatArray
 from sysid.data.records import Record
 from sysid.judgement.levels import NOTABLE_MOVE, STRONG_ODDS
 from sysid.judgement.residual_context import Simulations
 from sysid.models.kalman_filter import is_noise_parameter
-from sysid.results.findings import Finding, list_moves
+from sysid.results.findings import list_moves
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate

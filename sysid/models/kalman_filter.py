@@ -224,7 +224,7 @@ def list_noise_parameters(model: Model, noise: NoiseModel) -> tuple[Parameter, .
     """
     if noise not in FILTERED:
         return ()
-    filtered = add_kalman_filter(model, noise, NoiseScales({}, 1.0, 1.0))
+    filtered = add_kalman_filter(model, noise, NoiseScales({}, 1.0, 1.0, 1.0), {})
     added = filter(lambda one: is_noise_parameter(one.name), filtered.parameters)
     return tuple(replace(one, lower=_ANY_LOWER, upper=_ANY_UPPER) for one in added)
 

@@ -42,7 +42,7 @@ def exclude_ranges(kept: KeptRows, conditions: Sequence[str], notes: list[str]) 
         if column.role in ("time", "date"):
             found = _find_range(times, text, condition)
         elif values[place].dtype.kind == "U":
-            found = np.array([one.lower() == text.lower() for one in values[place].tolist()])
+            found = np.asarray(np.char.lower(values[place].astype(np.str_)) == text.lower())
         else:
             found = _find_range(np.asarray(values[place], dtype=np.float64), text, condition)
             if column.role == "value":

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sysid.core.findings import Finding, Move
 from sysid.core.settings import Loss, NoiseModel
 from sysid.data.records import Channel, Record
 from sysid.judgement.conclusions import conclude_estimates, conclude_verdict
@@ -15,7 +16,6 @@ from sysid.judgement.noise_sources import (
     open_defect,
 )
 from sysid.models.catalogue.load import load_model
-from sysid.results.findings import Finding, Move
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
 from tests.support.library.search_problems import example
