@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from service.formats.read_options import ReadOptions
 from service.formats.tabular.cells import classify_cell
 from service.formats.tabular.csv_recordings import read_csv
 from service.formats.tabular.table_layout import PEEK_ROWS, SEPARATORS
@@ -94,7 +95,7 @@ def list_texts(draw: st.DrawFn) -> Text:
 @settings(max_examples=scale_examples(150))
 def test_numbers_names_and_units_come_back_from_any_layout(text: Text) -> None:
     content = text.write()
-    recording, _ = read_csv(content.encode())
+    recording, _ = read_csv(content.encode(), ReadOptions(missing=("none",)))
     wanted = [name.replace(" ", "_") if text.separator == " " else name for name in text.names]
     assert list(recording.names) == wanted, content
     units = ["1"] * len(text.names) if text.heading == "none" else list(text.units)

@@ -164,6 +164,8 @@ def list_signals(long: LongTable, notes: list[str]) -> list[TableSignal]:
     names = long.names
     column = long.table.columns[long.entry]
     listed = list(dict.fromkeys(names[np.argsort(long.table.rows, kind="stable")].tolist()))
+    if len(listed) == 1 and find_entry([column.name]) is None:
+        names, listed = np.full(names.size, column.name), [column.name]  # a remark, not a name
     signals, texts = [], []
     bad_words = Counter[tuple[str, str]]()
     for name in filter(None, listed):

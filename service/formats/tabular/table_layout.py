@@ -228,10 +228,24 @@ def _check_width(rows: Sequence[_Row], options: ReadOptions) -> None:
 
 def _find_block(rows: Sequence[_Row], separator: str) -> _DataBlock:
     """Find the longest run of rows of data, and the rows before it that are not blank."""
+    full = [row for row in rows if any(map(str.strip, row.fields))]
+    first, stop = _find_longest_run(full)
+    if _has_words_among(full[:first], len(full[first].fields) if stop else 0):
+        first = 1
+    data = [row for row in full[first:stop] if not is_comment(row.fields)]
+    data = data[: len(data) - _count_last_words([row.fields for row in data], 0)]
+    if len(data) > 1 and not first and _is_header_of(data[0].fields, data[1].fields):
+        return _DataBlock(separator, full[:1], data[1:])
+    if not data:
+        return _DataBlock(separator, list(full), [])
+    return _DataBlock(separator, full[:first], data)
+
+
+def _find_longest_run(rows: Sequence[_Row]) -> tuple[int, int]:
+    """Find the first row of the longest run of data of one width, and the row after its last."""
     best: tuple[int, int] = (0, 0)
     start, width = 0, -1
-    full = [row for row in rows if any(map(str.strip, row.fields))]
-    for number, row in enumerate(full):
+    for number, row in enumerate(rows):
         if is_comment(row.fields):
             continue
         if _is_data(row.fields):
@@ -241,14 +255,24 @@ def _find_block(rows: Sequence[_Row], separator: str) -> _DataBlock:
                 best = (start, number + 1)
         else:
             width = -1
-    first, stop = best
-    data = [row for row in full[first:stop] if not is_comment(row.fields)]
-    data = data[: len(data) - _count_last_words([row.fields for row in data], 0)]
-    if len(data) > 1 and not first and _is_header_of(data[0].fields, data[1].fields):
-        return _DataBlock(separator, full[:1], data[1:])
-    if not data:
-        return _DataBlock(separator, list(full), [])
-    return _DataBlock(separator, full[:first], data)
+    return best
+
+
+def _has_words_among(rows: Sequence[_Row], width: int) -> bool:
+    """Whether rows are a header of words, and below it rows of data among which words stand."""
+    return (
+        len(rows) > 1
+        and all(len(row.fields) == width for row in rows)
+        and set(map(classify_cell, rows[0].fields)) == {"text"}
+        and all(set(map(classify_cell, row.fields)) - {"text", "empty"} for row in rows[1:])
+    )
+
+
+def _hides_separators(block: _DataBlock) -> bool:
+    """Whether blanks divide a row that has other separators."""
+    return block.separator == " " and any(
+        separator in field for field in block.data[0].fields for separator in SEPARATORS[:-1]
+    )
 
 
 def count_footer_rows(rows: Sequence[Sequence[str]], columns: Sequence[TableColumn]) -> int:
@@ -308,7 +332,12 @@ def _choose_block(blocks: Sequence[_DataBlock], lines: Sequence[str], named: int
     if found:
         return max(
             found,
-            key=lambda one: (one.width == named, one.has_header, len(one.data), one.width),
+            key=lambda one: (
+                one.width == named and not _hides_separators(one),
+                one.has_header,
+                len(one.data),
+                one.width,
+            ),
         )
     single = next((block for block in blocks if block.data), None)
     if single is not None:

@@ -302,6 +302,27 @@ def test_rows_of_doses_and_observations_are_channels() -> None:
     assert recording.channel("DV").values.tolist() == [0.5, 3.0, 2.5, 0.5, 3.0, 2.5]
 
 
+def test_a_word_among_the_values_of_a_long_table_is_no_header() -> None:
+    text = "tag,time,value\n" + "".join(
+        f"{name},{i},{'open' if i == 3 else i}\n" for name in "ab" for i in range(20)
+    )
+    assert "row 5, column 'value': found 'open'" in str(refuse(text))
+    recording, _ = read(text, missing="open")
+    assert (recording.names, recording.channel("a").values.size) == (("a", "b"), 19)
+
+
+def test_names_do_not_choose_blanks_inside_of_stamps() -> None:
+    text = "2026-01-01 10:00:00,1,2\n2026-01-01 10:00:01,1,3\n2026-01-01 10:00:02,1,4\n"
+    assert "the table has 3 columns, and 2 names" in str(refuse(text, columns="t,u"))
+    assert read(text, columns="t,u,y")[0].channel("y").values.tolist() == [2.0, 3.0, 4.0]
+
+
+def test_a_constant_text_beside_one_signal_names_nothing() -> None:
+    rows = "".join(f"{t:.1f},{y:.6f},run 7\n" for t, y in zip(TIMES, OUTPUT, strict=True))
+    assert read("t,y,name\n" + rows)[0].names == ("y",)
+    assert read("t,value,name\n" + rows)[0].names == ("run 7",)
+
+
 def test_measurements_below_each_other_are_no_long_table() -> None:
     rows = "".join(f"{run},{t:.1f},{t},{t}\n" for run in "AB" for t in TIMES)
     recording, _ = read("run,t,u,y\n" + rows)
