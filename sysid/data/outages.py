@@ -4,7 +4,7 @@ Empty cells and missing rows are the same here: a sample without a value is no s
 lost one by one leave gaps of a geometric length. If each is lost with probability q, a gap has k
 rows or more with probability qᵏ (Feller, Introduction to Probability I, 1968, VI.8). A gap that is
 longer than all N intervals explain is an outage. The gaps are taken from the shortest on, so that
-one outage does not hide another.
+one outage does not hide another. Others of its size count with them, so that bursts have none.
 
 An input that may have moved unseen in an outage leaves the states and its own past unknown. So the
 record ends there, and another begins after it. Its first part is kept as the past of the inputs, as
@@ -25,6 +25,7 @@ from sysid.data.records import Channel, Record, Recording, select_known
 
 _UNLIKELY = 1e-3  # probability that lost rows leave such a gap: one in a thousand records
 _MIN_SAMPLES = 10
+_SAME_SIZE = 2  # times as long: of seven bursts of samples, the gaps are up to 1.3 times
 _MIN_DOUBLES = 4  # lost rows: fewer may keep in step by chance
 _UNSEEN_SHARE = 0.1
 """Of an input's variance: mean square error of its values across such a gap, elsewhere in the
@@ -94,7 +95,8 @@ def find_outages(times: FloatArray) -> list[Outage]:
     if not gaps.size:
         return []
     gaps = gaps[np.argsort(lost[gaps], kind="stable")]
-    smaller = int(np.count_nonzero(lost == 1)) + np.concatenate([[0], np.cumsum(lost[gaps])[:-1]])
+    last = np.searchsorted(lost[gaps], _SAME_SIZE * lost[gaps], side="right") - 1
+    smaller = int(np.count_nonzero(lost == 1)) + np.cumsum(lost[gaps])[last] - lost[gaps]
     rate = (smaller + 1.0) / (smaller + 1.0 + lost.size)
     is_outage = np.log(lost.size) + lost[gaps] * np.log(rate) < np.log(_UNLIKELY)
     if not is_outage.any():

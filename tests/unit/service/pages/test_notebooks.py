@@ -93,6 +93,6 @@ def test_a_notebook_has_all_code_of_its_page(path: str) -> None:
 
 def test_all_tutorials_are_notebooks_and_no_other_page() -> None:
     paths = list_notebooks()
-    assert sum(path.startswith("tutorials/") for path in paths) == 6
+    assert sum(path.startswith("tutorials/") for path in paths) == 7
     assert make_notebook("model.ipynb") is None
     assert make_notebook("tutorials/pictures/first_time_lag.ipynb") is None
