@@ -3,9 +3,9 @@
 In an unstable plant each disturbance grows, and a free run attributes all of it to the parameters:
 its estimates are far off, or those of a stable plant. Such a plant is recorded in a closed loop
 only. A filter corrects the states by each measured output, so it forgets disturbances
-(Ljung, System Identification, 2nd ed., ch. 3.2 and 13). A recursion has no filter, and is predicted
-one step ahead. That needs outputs that are states, and measurements whose noise is small beside
-the disturbances.
+(Ljung, System Identification, 2nd ed., ch. 3.2 and 13). Where none can be built, a recursion is
+predicted one step ahead. That needs outputs that are states, and measurements whose noise is small
+beside the disturbances.
 
 So if residuals are not white, and an input follows them or the free run is unstable, the model is
 fitted to such predictions as well. Its estimates are reported if the free run is unstable there

@@ -151,7 +151,7 @@ def test_the_wheel_names_its_version_licence_extras_and_command(wheel: Path) -> 
     assert about["License-Expression"] == "Apache-2.0"
     assert about["Requires-Python"] == ">=3.11"
     assert {*about.get_all("Provides-Extra")} == {
-        *("server", "postgres", "notebook", "parquet", "test")
+        *("server", "postgres", "notebook", "parquet", "matlab", "test")
     }
     classifiers = about.get_all("Classifier")
     assert {f"Programming Language :: Python :: {one}" for one in PYTHONS} <= {*classifiers}

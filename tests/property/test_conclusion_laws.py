@@ -141,7 +141,11 @@ def test_statuses_and_verdict_do_not_contradict_each_other(
         if new != old:
             assert verdict.trust != "trustworthy"
             assert old.status != "identified" or new.reason
-            assert replace(new, status=old.status, reason=old.reason) == old
+            kept = replace(new, status=old.status, reason=old.reason, interval95=old.interval95)
+            assert kept == old
+            assert old.interval95 is not None
+            assert new.interval95 is not None
+            assert new.interval95[0] <= old.interval95[0] < old.interval95[1] <= new.interval95[1]
     if verdict.trust == "limited":
         doubtful = [one for one in concluded if one.is_free and one.status != "identified"]
         assert all(one.name in verdict.text.split(":")[0] for one in doubtful)

@@ -54,7 +54,7 @@ VALUES: dict[tuple[str, str], list[tuple[str, ...]]] = {
 """Field and name of a setting → names and values for what is open in it."""
 NAMES = {"skip": ("8",), "initial": ("rest", "free")}
 """A setting without entries whose value is open in a text → values of it."""
-OF_A_MODEL = {"history"}
+OF_A_MODEL = {"history", "plant"}
 """Fields of the model's document that messages about this document write."""
 QUICK = ("--set", "algorithm.generations=2")
 BODY = {"model": "fopdt", "datasets": ["a"]}

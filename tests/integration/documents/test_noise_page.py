@@ -1,4 +1,4 @@
-"""The page on noise: its example prints what it says."""
+"""The page on noise: its examples print what it says."""
 
 import re
 from pathlib import Path
@@ -8,8 +8,11 @@ import pytest
 PAGE = Path("docs/explanation/noise.md").read_text(encoding="utf-8")
 
 
-def test_the_example_of_the_page_prints_its_output(capsys: pytest.CaptureFixture[str]) -> None:
-    [code] = re.findall(r"```python\n(.*?)```", PAGE, re.S)
-    [printed] = re.findall(r"```text\n(.*?)```", PAGE, re.S)
-    exec(code, {})
-    assert capsys.readouterr().out == printed
+def test_the_examples_of_the_page_print_their_outputs(capsys: pytest.CaptureFixture[str]) -> None:
+    examples = re.findall(r"```python\n(.*?)```", PAGE, re.S)
+    names: dict[str, object] = {}
+    for code in examples:
+        exec(code, names)
+    outputs = re.findall(r"```text\n(.*?)```", PAGE, re.S)
+    assert len(outputs) == len(examples)
+    assert capsys.readouterr().out == "".join(outputs)
