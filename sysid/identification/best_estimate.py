@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sysid.core.findings import Finding
 from sysid.core.settings import GeneticAlgorithm, StartKind
 from sysid.core.types import FloatArray
 from sysid.identifiability.exchange import (
@@ -425,8 +426,7 @@ class _EstimateSearch:
 
         It is as ordinary as the free run, so it takes strong odds. What was found has those of a
         defect, but for a closed loop, in which noise is a part of the input. The states may start
-        otherwise beside a filter. An input that follows the residuals, and an unstable plant, show
-        that there is a controller.
+        otherwise beside a filter.
         """
         problem = self.problem
         if not self._may_choose_noise() or explained.criterion == -inf:
@@ -441,22 +441,21 @@ class _EstimateSearch:
         first_order, spent = fit_first_order_criterion(problem, self.theta)
         self._budget.spend(filters.evaluations + spent)
         gain = min(explained.criterion, first_order) - found.criterion
-        feedback = tuple(
-            find_feedback(problem, problem.predict(self.theta[None])[0], self.analysis)
-        )
-        commands = problem.settings.commands
-        has_controller = bool(feedback or commands) or (
-            commands is None and compute_growth(problem, self.theta) >= MIN_GROWTH
-        )
         defects = max(explained.odds, 0.0)
+        is_likely, is_close = gain > STRONG_ODDS, gain - defects <= STRONG_ODDS
+        feedback: tuple[Finding, ...] = ()
+        if is_likely:
+            simulated = problem.predict(self.theta[None])[0]
+            feedback = tuple(find_feedback(problem, simulated, self.analysis))
+        has_controller = is_likely and is_close and self._has_controller(feedback)
         values = dict(zip(problem.free_names, self.theta.tolist(), strict=True))
-        if gain <= STRONG_ODDS or (gain <= defects and not has_controller):
+        if not is_likely or (gain <= defects and not has_controller):
             least = max(defects - STRONG_ODDS, 0.0)
             own = found.criterion + gain
             self.sources = SourceComparison("", values, self._list_open([found], own, least))
             return False
         others = self._list_open(filters.fits[1:], found.criterion, -STRONG_ODDS)
-        if gain - defects <= STRONG_ODDS and explained.findings and not has_controller:
+        if is_close and explained.findings and not has_controller:
             others = (*others, open_defect(explained.findings[0], values, defects - gain))
         self.sources = SourceComparison(name_source(found.problem), found.values, others)
         self.free_run = ReplacedRun(values, gain, feedback)
@@ -464,6 +463,13 @@ class _EstimateSearch:
         equal = found.problem.rebuild(deviations=None)
         self._continue_with(equal, found.theta, found.sizes)
         return True
+
+    def _has_controller(self, feedback: Sequence[Finding]) -> bool:
+        """Whether a controller is declared or seen; an unstable plant must have one."""
+        commands = self.problem.settings.commands
+        if feedback or commands:
+            return True
+        return commands is None and compute_growth(self.problem, self.theta) >= MIN_GROWTH
 
     def _list_open(
         self, fits: Sequence[FilteredFit], criterion: float, least: float

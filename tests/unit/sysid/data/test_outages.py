@@ -51,6 +51,14 @@ def test_rows_that_are_lost_one_by_one_are_no_outage() -> None:
         assert find_outages(times) == []
 
 
+def test_gaps_between_bursts_of_a_few_samples_are_no_outages() -> None:
+    begins = np.cumsum([0, 30, 34, 36, 33, 35, 31])
+    times = (begins[:, None] + np.arange(5)).ravel().astype(float)
+    assert find_outages(times) == []
+    once = np.concatenate([np.arange(40.0), 60.0 + np.arange(40.0)])
+    assert [one.rows for one in find_outages(once)] == [20]  # such a gap alone is one
+
+
 def test_one_outage_does_not_hide_another() -> None:
     times = np.delete(np.arange(1000.0), np.r_[100:300, 500:700])
     assert [(one.start, one.rows) for one in find_outages(times)] == [(99.0, 200), (499.0, 200)]

@@ -14,8 +14,9 @@ from sysid.data.records import Channel, Record
 from sysid.models.kalman_filter import list_plant_noise
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
+from tests.support.library.walking_records import PERIOD, SAMPLES, make_walk
 
-PERIOD, SAMPLES, LAG = 0.25, 60, 19 / 32  # the lag ends with an integration step
+LAG = 19 / 32  # it ends with an integration step
 GAIN, CONSTANT, LOAD, CORRELATION = 2.0, 3.0, 1.7, 4.0
 
 
@@ -72,18 +73,6 @@ def discretise(
     return phi, drive, covariance
 
 
-def _record(outputs: Sequence[str] = ("y",), missing: Sequence[int] = ()) -> Record:
-    random = np.random.default_rng(5)
-    times = PERIOD * np.arange(SAMPLES)
-    u = random.normal(size=SAMPLES)
-    channels = []
-    for name in outputs:
-        y = np.cumsum(0.3 * random.normal(size=SAMPLES))
-        y[list(missing)] = np.nan
-        channels.append(Channel(name, times, y))
-    return Record((Channel("u", times, u, hold="zero"),), tuple(channels))
-
-
 def _write_lagged(substeps: int = 8, **fields: Any) -> dict[str, Any]:
     return {
         "name": "lagged",
@@ -120,7 +109,7 @@ def _list_lagged_steps(u: FloatArray) -> list[tuple[FloatArray, FloatArray, Floa
 
 @pytest.mark.parametrize("missing", [(), (3, 4, 5, 6, 30)])
 def test_a_load_behind_a_lag_has_its_exact_likelihood(missing: Sequence[int]) -> None:
-    record = _record(missing=missing)
+    record = make_walk(missing=missing)
     problem = Problem.build(parse_model(_write_lagged()), [record], loss=Loss(noise_model="load"))
     theta = np.array([[GAIN, CONSTANT, LAG, LOAD, CORRELATION]])
     assert problem.free_names == ("K", "T", "L", "load[u]", "tau[u]")
@@ -151,7 +140,7 @@ def test_two_outputs_and_noise_in_two_states_have_their_exact_likelihood() -> No
         outputs={"y": "x", "z": "x + v"},
         initial={"x": 0.4, "v": -0.2},
     )
-    record = _record(("y", "z"))
+    record = make_walk(("y", "z"))
     weights = {"y": 2.0, "z": 0.5}
     problem = Problem.build(
         parse_model(document), [record], loss=Loss(noise_model="plant"), weights=weights
@@ -183,7 +172,7 @@ def test_two_outputs_and_noise_in_two_states_have_their_exact_likelihood() -> No
 
 def test_the_drift_of_a_sensor_is_a_load_at_its_output() -> None:
     document = _write_lagged(noise={"load": {"y": "estimate"}})
-    record = _record()
+    record = make_walk()
     problem = Problem.build(parse_model(document), [record], loss=Loss(noise_model="load"))
     assert problem.free_names == ("K", "T", "L", "load[y]", "tau[y]")
     theta = np.array([[GAIN, CONSTANT, LAG, LOAD, CORRELATION]])
@@ -209,11 +198,11 @@ def test_a_document_names_the_places_of_noise() -> None:
     model = parse_model(document)
     assert model.document["noise"] == document["noise"]
     assert parse_model(model.document) == model
-    both = Problem.build(model, [_record()], loss=Loss(noise_model="plant"))
+    both = Problem.build(model, [make_walk()], loss=Loss(noise_model="plant"))
     assert both.free_names == ("K", "T", "L", "noise[x]", "load[u]", "tau[u]")
-    load = Problem.build(model, [_record()], loss=Loss(noise_model="load"))
+    load = Problem.build(model, [make_walk()], loss=Loss(noise_model="load"))
     assert load.free_names == ("K", "T", "L", "load[u]", "tau[u]")
-    white = Problem.build(model, [_record()], loss=Loss(noise_model="white"))
+    white = Problem.build(model, [make_walk()], loss=Loss(noise_model="white"))
     assert white.free_names == ("K", "T", "L")
     assert (white.is_free_run, both.is_free_run) == (True, False)
     assert list_plant_noise(model) == ("load", "plant", "drift")
@@ -222,10 +211,10 @@ def test_a_document_names_the_places_of_noise() -> None:
 
 def test_sizes_of_noise_are_changed_where_a_filter_is_asked_for() -> None:
     model, changes = parse_model(_write_lagged()), {"tau[u]": {"fixed": 5.0}}
-    load = Problem.build(model, [_record()], parameters=changes, loss=Loss(noise_model="load"))
+    load = Problem.build(model, [make_walk()], parameters=changes, loss=Loss(noise_model="load"))
     assert "tau[u]" not in load.free_names
     with pytest.raises(InvalidSettings, match=r"Set loss: \{noise_model: load\}"):
-        Problem.build(model, [_record()], parameters=changes)
+        Problem.build(model, [make_walk()], parameters=changes)
 
 
 @pytest.mark.parametrize(
@@ -260,7 +249,7 @@ def test_noise_without_a_place_is_a_fault(noise: object, pointer: str, text: str
 def test_irregular_samples_are_refused_with_the_way_out() -> None:
     random = np.random.default_rng(1)
     times = np.sort(random.random(SAMPLES)) * PERIOD * SAMPLES
-    record = _record()
+    record = make_walk()
     irregular = Record(record.inputs, (Channel("y", times, np.sin(times)),))
     with pytest.raises(InvalidSettings, match="/solver/step"):
         Problem.build(parse_model(_write_lagged()), [irregular], loss=Loss(noise_model="load"))
@@ -273,13 +262,13 @@ def test_only_squares_and_no_other_predictions_go_with_noise_in_the_plant() -> N
         loss = Loss(noise_model=noise)  # type: ignore[arg-type]
         with pytest.raises(InvalidSettings, match="simulation"):
             Problem.build(
-                parse_model(_write_lagged()), [_record()], loss=loss, prediction="one-step"
+                parse_model(_write_lagged()), [make_walk()], loss=loss, prediction="one-step"
             )
 
 
 def test_an_individual_has_the_same_bits_alone_and_among_others() -> None:
     problem = Problem.build(
-        parse_model(_write_lagged()), [_record(missing=(3,))], loss=Loss(noise_model="load")
+        parse_model(_write_lagged()), [make_walk(missing=(3,))], loss=Loss(noise_model="load")
     )
     random = np.random.default_rng(3)
     lower = np.array([p.lower for p in problem.free_parameters])
@@ -295,7 +284,7 @@ def test_an_individual_has_the_same_bits_alone_and_among_others() -> None:
 
 
 def test_a_plant_at_rest_was_moved_by_its_load_before_the_record() -> None:
-    record = _record()
+    record = make_walk()
     model = parse_model(_write_lagged(initial="steady"))
     problem = Problem.build(model, [record], loss=Loss(noise_model="load"))
     theta = np.array([[GAIN, CONSTANT, LAG, LOAD, CORRELATION]])
@@ -317,7 +306,7 @@ def test_a_plant_at_rest_was_moved_by_its_load_before_the_record() -> None:
 
 def test_a_start_behind_an_integrator_is_known_and_its_load_is_stationary() -> None:
     document = _write_lagged(equations={"x": "K*u(t - L)/T"})
-    problem = Problem.build(parse_model(document), [_record()], loss=Loss(noise_model="load"))
+    problem = Problem.build(parse_model(document), [make_walk()], loss=Loss(noise_model="load"))
     theta = np.array([[GAIN, CONSTANT, LAG, LOAD, CORRELATION]])
     _, deviations = problem.predict_ahead(theta)
     assert deviations[0, 0] == 1.0

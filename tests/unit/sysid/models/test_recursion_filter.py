@@ -9,26 +9,14 @@ from scipy.linalg import solve_discrete_lyapunov
 from sysid.core.errors import InvalidModel
 from sysid.core.settings import Loss
 from sysid.core.types import FloatArray
-from sysid.data.records import Channel, Record
+from sysid.data.records import Record
 from sysid.models.kalman_filter import list_plant_noise
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
+from tests.support.library.walking_records import PERIOD, SAMPLES, make_walk
 from tests.unit.sysid.models.test_kalman_filter import filter_outputs
 
-PERIOD, SAMPLES = 0.25, 60
 A, B, G, LAG, NOISE = 1.5, -0.7, 0.4, 0.75, 0.6
-
-
-def _record(outputs: tuple[str, ...] = ("y",), missing: tuple[int, ...] = ()) -> Record:
-    random = np.random.default_rng(5)
-    times = PERIOD * np.arange(SAMPLES)
-    u = random.normal(size=SAMPLES)
-    channels = []
-    for name in outputs:
-        y = np.cumsum(0.3 * random.normal(size=SAMPLES))
-        y[list(missing)] = np.nan
-        channels.append(Channel(name, times, y))
-    return Record((Channel("u", times, u, hold="zero"),), tuple(channels))
 
 
 def _write(**fields: Any) -> dict[str, Any]:
@@ -76,7 +64,7 @@ HELD: Step = (np.array([[1.0, 0.0], [1.0, 0.0]]), np.zeros(2), np.zeros((2, 2)))
 
 @pytest.mark.parametrize("missing", [(), (3, 4, 5, 30)])
 def test_noise_in_a_linear_recursion_has_its_exact_likelihood(missing: tuple[int, ...]) -> None:
-    record = _record(missing=missing)
+    record = make_walk(missing=missing)
     problem = Problem.build(parse_model(_write()), [record], loss=Loss(noise_model="plant"))
     assert problem.free_names == ("a", "b", "g", "L", "noise[x]")
     y = record.outputs[0].values[:, None]
@@ -98,7 +86,7 @@ def test_noise_in_a_linear_recursion_has_its_exact_likelihood(missing: tuple[int
 
 
 def test_a_measured_start_has_the_error_of_its_samples() -> None:
-    record = _record()
+    record = make_walk()
     model = parse_model(_write(initial={"x": "measured"}))
     problem = Problem.build(model, [record], loss=Loss(noise_model="plant"))
     y = record.outputs[0].values
@@ -116,7 +104,7 @@ def test_a_measured_start_has_the_error_of_its_samples() -> None:
 
 
 def test_a_recursion_at_rest_was_moved_by_its_noise_before_the_record() -> None:
-    record = _record()
+    record = make_walk()
     model = parse_model(_write(initial="steady"))
     problem = Problem.build(model, [record], loss=Loss(noise_model="plant"))
     spread = solve_discrete_lyapunov(TANGENT, np.diag([NOISE**2, 0.0]))
@@ -129,7 +117,7 @@ def test_a_recursion_at_rest_was_moved_by_its_noise_before_the_record() -> None:
 
 
 def test_without_noise_of_the_sensor_predictions_start_from_measured_values() -> None:
-    record = _record()
+    record = make_walk()
     noise = {"noise[x]": {"fixed": 1e4}}
     for initial, first in (("measured", 2), (0.4, 4)):  # a given start is no measured value
         model = parse_model(_write(initial={"x": initial}))
@@ -144,7 +132,7 @@ def test_without_noise_of_the_sensor_predictions_start_from_measured_values() ->
 
 
 def test_a_load_of_a_recursion_is_an_ornstein_uhlenbeck_process() -> None:
-    record = _record()
+    record = make_walk()
     load, time = 1.7, 4.0
     model = parse_model(_write(noise={"load": {"u": "estimate"}}))
     problem = Problem.build(model, [record], loss=Loss(noise_model="load"))
@@ -179,7 +167,7 @@ def test_noise_enters_states_that_are_read_at_the_same_sample() -> None:
         initial={"x": 0.4, "w": -0.2},
         noise={"plant": {"x": "estimate", "w": "estimate"}},
     )
-    record = _record(("y", "z"))
+    record = make_walk(("y", "z"))
     weights = {"y": 2.0, "z": 0.5}
     problem = Problem.build(
         parse_model(document), [record], loss=Loss(noise_model="plant"), weights=weights
@@ -215,7 +203,7 @@ def _write_delayed(upper: float, **fields: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("history", ["constant", "zero"])
 def test_a_short_unknown_lag_of_a_state_has_its_exact_likelihood(history: str) -> None:
-    record, lag = _record(), 1.65  # 6.6 samples
+    record, lag = make_walk(), 1.65  # 6.6 samples
     theta = np.array([[0.7, B, G, lag, NOISE]])
     moved = np.eye(8, k=-1)
     moved[0] = [0.7, *[0.0] * 5, 0.4 * B, 0.6 * B]
@@ -267,7 +255,7 @@ def test_the_documents_of_recursions_name_their_places_of_noise() -> None:
 
 def test_an_individual_has_the_same_bits_alone_and_among_others() -> None:
     model = parse_model(_write(initial={"x": "measured"}))
-    problem = Problem.build(model, [_record(missing=(3,))], loss=Loss(noise_model="plant"))
+    problem = Problem.build(model, [make_walk(missing=(3,))], loss=Loss(noise_model="plant"))
     random = np.random.default_rng(3)
     lower = np.array([p.lower for p in problem.free_parameters])
     upper = np.array([p.upper for p in problem.free_parameters])
